@@ -12,7 +12,7 @@ from scenes import SCENE
 from scipy.spatial.transform import Rotation
 
 from mjx_reinforce import envs
-from mjx_reinforce.engine.physics import contact_rows, contacts, rows, touching
+from mjx_reinforce.engine.physics import contact_rows, contacts, rows
 from mjx_reinforce.engine.physics.mjx_internals import jax_fields, with_contact
 from mjx_reinforce.envs import models
 
@@ -199,183 +199,13 @@ def test_pairs_that_mjx_gets_wrong_are_refused_if_they_can_meet():
 
 
 # -------------------------------------------------------------------------------------------------
-# Pairs one after the other: the contacts of all pairs at once, wherever geoms touch.
-
-IN_TURN = np.array([[0, 1], [1, 2], [3, 0], [2, 3]])
-#: Geoms 0 and 1 overlap, 2 is within its margin of 1, 3 is apart from all but 2.
-PLACES = np.float32([[0, 0, 0], [0.4, 0.1, 0], [1.2, 0, 0.3], [3.0, 1.0, -2.0]])
+# Which degrees of freedom a contact couples.
 
 
-def collide(model, data, key, geoms):
-    """Two contacts a pair, of spheres with a number of their own in the geom's size."""
-    del key
-    away = data.geom_xpos[geoms[:, 1]] - data.geom_xpos[geoms[:, 0]]
-    radii = model.geom_size[geoms].sum(axis=(1, 2))
-    dist = jnp.linalg.norm(away, axis=1) - radii
-    turned = jnp.einsum("pij,pj->pi", data.geom_xmat[geoms[:, 0]], away)
-    return (
-        jnp.repeat(dist, 2),
-        jnp.repeat(turned, 2, axis=0) * jnp.tile(jnp.array([[1.0], [2.0]]), (len(geoms), 1)),
-        jnp.repeat(data.geom_xmat[geoms[:, 1]], 2, axis=0),
-    )
-
-
-collide.ncon = 2  # pyright: ignore[reportFunctionMemberAccess]
-
-
-def model_of(num_pairs=0, margins=(0.0, 0.0, 0.2, 0.0)):
-    size = np.float32([[0.3], [0.2], [0.45], [0.5]])
-    rbound = size[:, 0] + np.float32([0.0, 0.0, 0.05, 0.0])
-    return types.SimpleNamespace(
-        npair=num_pairs, geom_rbound=rbound, geom_margin=np.float32(margins), geom_size=size
-    )
-
-
-def data_of(places=PLACES):
-    mats = np.random.default_rng(0).normal(size=(4, 3, 3)).astype(np.float32)
-    return types.SimpleNamespace(geom_xpos=jnp.asarray(places), geom_xmat=jnp.asarray(mats))
-
-
-@pytest.fixture(autouse=True)
-def in_turn(monkeypatch):
-    monkeypatch.setattr(contacts, "by_engine", lambda one, many, *rows, may_unroll: one(*rows))
-
-
-def test_contacts_near_are_those_of_all_at_once_and_others_are_apart():
-    one, model, data = contacts.one_by_one(collide), model_of(), data_of()
-    assert one.ncon == 2  # pyright: ignore[reportFunctionMemberAccess]
-    got, want = one(model, data, None, IN_TURN), collide(model, data, None, IN_TURN)
-    near = np.array([True, True, True, True, False, False, False, False])
-    for x, exact in zip(got, want, strict=True):
-        assert (x.shape, x.dtype) == (exact.shape, exact.dtype)
-        np.testing.assert_allclose(x[near], exact[near], rtol=1e-6)
-    assert not any(np.any(x[~near]) for x in got[1:])
-    gap = np.linalg.norm(PLACES[[3, 2]] - PLACES[[0, 3]], axis=1) - [0.8, 1.0]
-    np.testing.assert_allclose(got[0][~near], np.repeat(gap, 2), rtol=1e-5)
-
-
-def test_a_geom_within_its_margin_is_collided():
-    """And with a smaller margin it is not."""
-    gap = {}
-    for margins in ((0.0, 0.0, 0.2, 0.0), (0.0, 0.2, 0.0, 0.0), (0.0, 0.05, 0.05, 0.0)):
-        got = contacts.one_by_one(collide)(model_of(margins=margins), data_of(), None, IN_TURN[1:2])
-        gap[margins] = float(np.abs(got[1]).max())
-    first, second, none = gap.values()
-    assert first == second > 0 == none
-
-
-def test_a_nan_reaches_the_contacts():
-    places = PLACES.copy()
-    places[0] = np.nan
-    dist, *_ = contacts.one_by_one(collide)(model_of(), data_of(places), None, IN_TURN)
-    np.testing.assert_array_equal(
-        np.isnan(dist), [True] * 2 + [False] * 2 + [True] * 2 + [False] * 2
-    )
-
-
-def test_pairs_with_margins_of_their_own_go_to_mjx(monkeypatch):
-    monkeypatch.setattr(contacts, "by_engine", lambda *_, **__: pytest.fail("one after the other"))
-    model, data = model_of(num_pairs=1), data_of()
-    got = contacts.one_by_one(collide)(model, data, None, IN_TURN)
-    jax.tree.map(np.testing.assert_array_equal, got, collide(model, data, None, IN_TURN))
-
-
-# -------------------------------------------------------------------------------------------------
-# Products with the Jacobian, at once and by contact, against NumPy's.
-
-DIMS = np.array([3, 1, 6, 4, 3, 1])
-NV = 5
-#: Any contact may couple any degrees of freedom.
-ANY = np.ones((NV, NV), bool)
-
-
-@pytest.fixture(params=["in turn", "at once"])
-def division(request, monkeypatch):
-    def choose(one, whole, *operands, may_unroll):
-        return (one if request.param == "in turn" else whole)(*operands)
-
-    monkeypatch.setattr(contact_rows, "by_engine", choose)
-    return contact_rows.blocks(2, DIMS, dict.fromkeys((1, 3, 4, 6), ANY))
-
-
-def rows_of(division):
-    """Which contact, in the order of the groups, each row is of; -1 for those of none."""
-    sizes = [len(group.pyramid) for group in division.groups for _ in range(group.contacts)]
-    return np.r_[[-1] * division.others, np.repeat(np.arange(len(sizes)), sizes)]
-
-
-def jacobian_of(division):
-    """Random rows; those of a contact are the edges of a pyramid."""
-    rng, parts = np.random.default_rng(0), []
-    for group in division.groups:
-        bases = rng.standard_normal((group.contacts, group.pyramid.shape[1], NV))
-        parts.append((group.pyramid @ bases).reshape(-1, NV))
-    return np.concatenate([rng.standard_normal((division.others, NV)), *parts])
-
-
-def problem(division, pushing):
-    """Random rows, of which those of contacts that do not push have no mass and no force."""
-    rng, contact = np.random.default_rng(0), rows_of(division)
-    pushes = (contact < 0) | np.isin(contact, pushing)
-    jacobian, force = jacobian_of(division), rng.standard_normal(len(contact))
-    mass = rng.uniform(1, 2, len(contact)) * pushes
-    mass[5] = 0  # a row of a contact that pushes by its others
-    return jacobian, mass, force * pushes
-
-
-def with_bases(division, rows, touching=True):
-    touches = jnp.broadcast_to(jnp.asarray(touching), len(DIMS))
-    return contact_rows.with_bases(division, jnp.asarray(rows), touches)
-
-
-def test_rows_of_a_contact_are_two_for_each_direction_of_friction():
-    couplings = dict.fromkeys((1, 3, 4, 6), ANY)
-    made = contact_rows.blocks(7, DIMS, couplings, may_unroll=False)
-    sizes = [(group.contacts, group.pyramid.shape) for group in made.groups]
-    assert sizes == [(2, (1, 1)), (2, (4, 3)), (1, (6, 4)), (1, (10, 6))]
-    assert (made.others, made.may_unroll) == (7, False)
-    (group,) = contact_rows.blocks(0, np.array([3]), couplings).groups
-    np.testing.assert_array_equal(group.pyramid, [[1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1]])
-
-
-@pytest.mark.parametrize("pushing", [[], [2, 3, 5], range(6)])
-def test_weighted(division, pushing):
-    rows, mass, force = problem(division, [*pushing])
-    start = np.eye(NV) + 1
-    jacobian = with_bases(division, rows)
-    made = contact_rows.weighted(
-        division, jnp.asarray(start), jacobian, jnp.asarray(mass), jnp.asarray(force)
-    )
-    np.testing.assert_allclose(made[0], start + rows.T @ np.diag(mass) @ rows, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(made[1], rows.T @ force, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("touching", [[], [0, 2, 4], range(6)])
-def test_along(division, touching):
-    """Rows of contacts that do not touch are zero."""
-    rows, direction = jacobian_of(division), np.arange(1.0, NV + 1)
-    contact = rows_of(division)
-    touches = np.isin(np.arange(6), [*touching])
-    rows[(contact >= 0) & ~touches[contact]] = 0
-    jacobian = with_bases(division, rows, touches)
-    made = contact_rows.along(division, jacobian, jnp.asarray(direction), jnp.asarray(touches))
-    np.testing.assert_allclose(made, rows @ direction, rtol=1e-5, atol=1e-5)
-
-
-def test_a_contact_that_does_not_touch_costs_no_product(monkeypatch):
-    """Its rows are not read: they may hold anything."""
-    monkeypatch.setattr(contact_rows, "by_engine", lambda one, _, *x, may_unroll: one(*x))
-    division = contact_rows.blocks(0, np.array([3, 3]), {3: ANY})
-    rows, touching = jnp.ones((8, NV)).at[4:].set(jnp.nan), jnp.array([True, False])
-    jacobian = contact_rows.with_bases(division, rows, touching)
-    made = contact_rows.along(division, jacobian, jnp.ones(NV), touching)
-    np.testing.assert_array_equal(made, [NV] * 4 + [0] * 4)
-
-
-@pytest.mark.parametrize("env_id", ["Ant-v5", pytest.param("Humanoid-v5", marks=pytest.mark.slow)])
-def test_what_no_contact_couples_is_zero_in_every_jacobian(env_id):
+@pytest.mark.slow
+def test_what_no_contact_couples_is_zero_in_every_jacobian():
     """Against MJX's rows with all contacts touching, at random poses."""
-    env = envs.make(env_id)
+    env = envs.make("Ant-v5")
     model = mjx.put_model(env.mj_model, impl="jax")
     couplings = contact_rows.couplings(model)
 
@@ -482,16 +312,6 @@ def test_states_reach_limits_and_contacts_of_every_dimension():
     assert int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT) in kinds
 
 
-def test_a_disabled_constraint_has_no_row():
-    disabled = mjx.put_model(MODEL, impl="jax")
-    flag = mjx.DisableBit.CONSTRAINT
-    disabled = disabled.replace(opt=disabled.opt.replace(disableflags=flag))
-    data = mjx.put_data(MODEL, random_state(0), impl="jax")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rows, "by_engine", lambda *_, **__: pytest.fail("it makes rows"))
-        assert jnp.size(jax_fields(rows.make_constraint(disabled, data)).efc_J) == 0
-
-
 HELD = """
 <mujoco><worldbody>
   <body name="a" pos="0 0 1">
@@ -530,60 +350,3 @@ def test_connects_and_welds_ask_for_what_c_asks():
     theirs = data.efc_aref[connect_first]
     np.testing.assert_allclose(found[:15], theirs, rtol=1e-10, atol=1e-10)
     assert np.abs(found[:15] - plain[:15]).max() > 1
-
-
-# -------------------------------------------------------------------------------------------------
-# Contacts that touch are brought together, and what is found for them goes back.
-
-
-def contacts_of(env_id):
-    data = mjx.make_data(envs.make(env_id).mj_model, impl="jax")
-    contact = jax_fields(data).contact
-    size = len(contact.dim)
-    return contact.replace(
-        dist=-1.0 - jnp.arange(size), pos=jnp.arange(3 * size, dtype=float).reshape(size, 3)
-    )
-
-
-def test_those_that_touch_come_first_in_their_order():
-    contacts, room = contacts_of("Ant-v5"), 6
-    pack = jax.jit(lambda touches: touching._pack(contacts, touches, room))
-    random = np.random.default_rng(0)
-    for chance in np.repeat([0.0, 0.1, 0.3, 1.0], 20):
-        touches = random.random(len(contacts.dim)) < chance
-        packed, count = pack(touches)
-        chosen = np.flatnonzero(touches)[:room]
-        assert count == touches.sum()
-        np.testing.assert_array_equal(packed.dist[: len(chosen)], contacts.dist[chosen])
-        np.testing.assert_array_equal(packed.pos[: len(chosen)], contacts.pos[chosen])
-        assert np.all(packed.dist[len(chosen) :] == np.inf)
-
-
-def test_values_go_back_to_the_contacts_that_touch():
-    random = np.random.default_rng(1)
-    unpack = jax.jit(touching._unpack)
-    for _ in range(20):
-        touches = random.random(25) < 0.15
-        chosen = np.flatnonzero(touches)[:6]
-        values = random.standard_normal((6, 4))
-        expected = np.zeros((25, 4), np.float32)
-        expected[chosen] = values[: len(chosen)]
-        if len(chosen) == touches.sum():  # there is room
-            given = unpack(values.astype(np.float32), touches)
-            np.testing.assert_array_equal(given, expected.reshape(-1))
-
-
-@pytest.mark.parametrize(
-    ("env_id", "contacts"),
-    [("Hopper-v5", 3), ("Pusher-v5", None)],
-    ids=["all have room", "few rows would be saved"],
-)
-def test_where_it_is_not_worth_it_the_solver_has_the_data_as_it_is(env_id, contacts):
-    env, asked = envs.make(env_id), []
-    data = mjx.make_data(env.mj_model, impl="jax")
-    contact = jax_fields(data).contact
-    few = jax.tree.map(lambda x: x[:contacts], contact)
-    data = with_contact(data, few, contact.dim[:contacts])
-    touching.solve_touching(lambda *given: asked.extend(given), env.model, data)
-    assert asked[0] is env.model
-    assert asked[1] is data

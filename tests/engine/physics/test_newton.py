@@ -2,7 +2,6 @@
 
 import functools
 import itertools
-import types
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ import pytest
 from mujoco import mjx
 
 from mjx_reinforce import envs
-from mjx_reinforce.engine.physics import contact_rows, limits, newton, step
+from mjx_reinforce.engine.physics import limits, newton, step
 from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.engine.physics.mjx_internals import jax_fields, with_fields
 
@@ -118,46 +117,17 @@ def test_in_loops_it_finds_the_same(problems, solve):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("double", [True, False])
-def test_ends_where_the_gradient_vanishes(problems, solve, double):
-    """No reference: the acceleration balances all forces."""
+def test_ends_where_the_gradient_vanishes(problems, solve):
+    """In single precision, of which there is no reference: the acceleration balances all forces."""
     model, ready = problems
-    qacc, joint_force, _ = solve(ready if double else in_single(ready))
+    qacc, joint_force, _ = solve(in_single(ready))
     with jax.enable_x64(True):
         inertia = np.asarray(jax.vmap(functools.partial(mjx.full_m, model))(ready))
     forces = np.asarray(ready.qfrc_smooth) + joint_force
     left = np.einsum("bij,bj->bi", inertia, qacc) - forces
     scale = 1 + np.abs(forces).max(axis=1, keepdims=True)
-    assert qacc.dtype == (np.float64 if double else np.float32)
-    assert np.max(np.abs(left) / scale) < (1e-10 if double else 1e-4)
-
-
-def test_the_line_search_finds_the_root_among_kinks():
-    """Against the least of the costs on a fine grid."""
-    random = np.random.default_rng(1)
-    for _ in range(20):
-        residual, change = random.standard_normal((2, 12))
-        mass = 10 ** random.uniform(-1, 3, 12)
-        none = contact_rows.Jacobian(jnp.zeros((12, 1)), [])
-        rows = newton.Rows(none, jnp.zeros(12), jnp.asarray(mass), jnp.array(False))
-        active = residual < 0
-        curvature = random.uniform(0.1, 1)
-        row_slope, row_curvature = mass * change * residual, mass * change**2
-        # Newton's own line has its root at a step of 1.
-        slope = -(curvature + (row_slope + row_curvature)[active].sum())
-        zero = jnp.zeros(())
-        start = newton._Point(zero, zero, jnp.asarray(residual))
-        without_rows = newton.Line(jnp.asarray(slope), jnp.asarray(curvature))
-        found = newton._line_search(rows, start, jnp.asarray(change), without_rows, 50)
-
-        def cost(length, args=(residual, change, mass, slope, curvature)):
-            residual, change, mass, slope, curvature = args
-            pushed = np.minimum(residual + np.multiply.outer(length, change), 0)
-            penalty = (mass * pushed**2).sum(-1) / 2
-            return slope * length + curvature * length**2 / 2 + penalty
-
-        grid = np.linspace(0, 3 * abs(float(found)) + 1, 20_001)
-        assert cost(np.float64(found)) <= cost(grid).min() + 1e-4 * abs(cost(grid).min())
+    assert qacc.dtype == np.float32
+    assert np.max(np.abs(left) / scale) < 1e-4
 
 
 @pytest.mark.slow
@@ -182,28 +152,6 @@ def test_an_optimum_is_left_as_it_is():
     data = data.replace(qvel=data.qvel.at[2].set(5.0))
     qacc = jax.jit(lambda data: physics.forward(model, data).qacc)(data)
     np.testing.assert_allclose(qacc, [0, 0, -9.81, 0, 0, 0], atol=1e-6)
-
-
-@pytest.mark.slow
-def test_caps_leave_no_more_cost_than_the_start(problems, solve):
-    model, ready = problems
-    fields = jax.tree.map(np.asarray, jax_fields(ready))
-    with jax.enable_x64(True):
-        inertia = np.asarray(jax.vmap(functools.partial(mjx.full_m, model))(ready))
-
-    def cost(qacc):
-        residual = np.einsum("brj,bj->br", fields.efc_J, qacc) - fields.efc_aref
-        equality = np.arange(residual.shape[1]) < fields.ne
-        pushed = np.where(equality | (residual < 0), residual, 0)
-        offset = qacc - np.asarray(ready.qacc_smooth)
-        inertial = np.einsum("bi,bij,bj->b", offset, inertia, offset)
-        return (inertial + (fields.efc_D * pushed**2).sum(axis=1)) / 2
-
-    before = cost(np.asarray(ready.qacc_smooth))
-    for cap in (1, 2):
-        after = cost(solve(ready, cap)[0])
-        assert np.all(after <= before)
-        assert np.median(after / before) < 0.5
 
 
 def test_other_models_go_to_mjx():
@@ -338,97 +286,3 @@ def test_as_many_rows_of_friction_are_no_limits():
         qacc = np.asarray(jax.jit(lambda data: step.solve_constraints(in_jax, data).qacc)(start))
     assert data.nefc == limits._limited_joints(in_jax).size
     np.testing.assert_allclose(qacc, data.qacc, rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_rows_are_those_of_the_limited_joints():
-    data = forward(STATES[4], (0, 0, 0, 0))
-    rows = jax.jit(lambda data: jax_fields(mjx.make_constraint(IN_JAX, data)).efc_J)
-    jacobian = rows(mjx.put_data(MODEL, data, impl="jax"))
-    assert limits._limited_joints(IN_JAX).tolist() == [0, 1, 3]
-    assert np.argmax(np.abs(jacobian), axis=1).tolist() == [0, 1, 3]
-    assert limits._coupled_rows(IN_JAX, np.array([0, 1, 3])) == [[0, 1], [2]]
-
-
-# -------------------------------------------------------------------------------------------------
-# Which solver finds the constraint forces, and where none is entered.
-
-SMOOTH = np.float32([3.0, 4.0])
-
-
-def data_of(rows=((0.0, 0.0), (0.0, 0.0)), dist=(0.1,), margin=(0.0,), ne=0, nf=0, nl=1):
-    """Two rows, one of a limit and one of a contact."""
-    contact = types.SimpleNamespace(
-        dist=jnp.float32(dist), includemargin=jnp.float32(margin), dim=np.array([3])
-    )
-    fields = types.SimpleNamespace(
-        efc_J=jnp.float32(rows), efc_force=jnp.ones(2), ne=ne, nf=nf, nl=nl, contact=contact
-    )
-    return types.SimpleNamespace(
-        _impl=fields,
-        qacc_smooth=jnp.asarray(SMOOTH),
-        qfrc_constraint=jnp.ones(2),
-        replace=lambda **changed: changed.values(),
-    )
-
-
-@pytest.fixture
-def chosen(monkeypatch):
-    """Solves data; what solves says its name by the acceleration."""
-
-    def solution(number):
-        return jnp.full(2, number), jnp.full(2, number), jnp.full(2, number)
-
-    def of(data, *, closed=False, past=False, ours=True):
-        monkeypatch.setattr(limits, "supports", lambda *_: closed)
-        monkeypatch.setattr(limits, "past_limit", lambda *_: jnp.array(past))
-        monkeypatch.setattr(limits, "solve_limits", lambda *_: solution(1.0))
-        monkeypatch.setattr(newton, "supports", lambda *_: ours)
-        monkeypatch.setattr(newton, "solve_newton", None)
-        monkeypatch.setattr(step.touching, "solve_touching", lambda *_: solution(2.0))
-        named = dict(zip(("qacc", "qfrc_constraint", "force"), solution(3.0), strict=True))
-        force = types.SimpleNamespace(efc_force=named.pop("force"))
-        theirs = types.SimpleNamespace(**named, _impl=force)
-        monkeypatch.setattr(step.mjx, "solve", lambda *_: theirs)
-        with_force = lambda found, efc_force: [*found, efc_force]  # noqa: E731
-        monkeypatch.setattr(step, "with_fields", with_force)
-        return [np.asarray(x).tolist() for x in step.solve_constraints(None, data)]  # pyright: ignore
-
-    return of
-
-
-NONE = [SMOOTH.tolist(), [0, 0], [0, 0]]
-
-
-@pytest.mark.parametrize("past", [False, True])
-def test_limits_alone_have_a_closed_form(chosen, past):
-    rows = ((1.0, 0.0), (0.0, 0.0))  # of a limit that is not the closed form's to judge
-    assert chosen(data_of(rows), closed=True, past=past) == ([[1, 1]] * 3 if past else NONE)
-
-
-@pytest.mark.parametrize(
-    ("changes", "active"),
-    [
-        ({}, False),
-        ({"dist": [0.0]}, False),
-        ({"dist": [-0.01]}, True),
-        ({"dist": [0.1], "margin": [0.2]}, True),
-        ({"dist": [np.nan]}, True),
-        ({"dist": []}, False),
-        ({"rows": [[0, 0.5], [0, 0]]}, True),
-        ({"rows": [[np.nan, 0], [0, 0]]}, True),
-        ({"rows": [[0, 0], [0.5, 0]]}, False),  # a contact's row, which is apart
-    ],
-)
-def test_the_solver_is_entered_where_a_row_is_active(chosen, changes, active):
-    changes.setdefault("margin", [0.0] * len(changes.get("dist", [0])))
-    assert chosen(data_of(**changes)) == ([[2, 2]] * 3 if active else NONE)
-
-
-@pytest.mark.parametrize("kind", ["ne", "nf"])
-def test_equalities_and_friction_are_always_active(chosen, kind):
-    assert chosen(data_of(**{kind: 1, "nl": 0})) == [[2, 2]] * 3
-
-
-def test_mjx_solves_what_newton_does_not(chosen):
-    assert chosen(data_of(dist=[-1.0]), ours=False) == [[3, 3]] * 3

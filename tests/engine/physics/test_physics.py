@@ -96,45 +96,6 @@ def assert_equal_to_mjx(ours, theirs, name, args, tolerance, **options):
     return actual
 
 
-def at_both_limits():
-    """The cart past the rail and the pole past its hinge limit, pushed in and out."""
-    signs = [
-        [a, b, c, d] for a in (1, -1) for b in (1, -1) for c in (4, 0.1, -4) for d in (9, 0.1, -9)
-    ]
-    signs = jnp.array(signs, float)
-    return signs[:, :2] * jnp.array([1.01, np.pi / 2 + 0.02]), signs[:, 2:], signs[:, :1] * 3
-
-
-def runge_kutta_of_mjx(model, data):
-    """A step of MJX, with the acceleration that C leaves behind it: the mean over the stages."""
-    end = mjx.step(model, data)
-    return end.replace(qacc=(end.qvel - data.qvel) / model.opt.timestep)
-
-
-@pytest.mark.slow
-def test_step_equals_mjx_in_double_precision():
-    with jax.enable_x64(True):
-        random = states(load("inverted_pendulum")[0])
-        args = [jnp.concatenate(pair) for pair in zip(random, at_both_limits(), strict=True)]
-        theirs = runge_kutta_of_mjx
-        actual = assert_equal_to_mjx(physics.step, theirs, "inverted_pendulum", args, 1e-12)
-        assert actual["qpos"].dtype == np.float64
-        assert (actual["row force"] > 0).all(axis=1).any()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "integrator"), [("reacher", "IMPLICITFAST"), ("swimmer", "EULER")]
-)
-def test_other_models_and_integrators(name, integrator):
-    """Rows in two kinematic trees; two coupled rows, with fluid forces."""
-    options = {"integrator": mjx.IntegratorType[integrator]}
-    with jax.enable_x64(True):
-        args = states(load(name)[0])
-        actual = assert_equal_to_mjx(physics.step, mjx.step, name, args, 1e-12, **options)
-        assert (actual["row force"] > 0).any()
-
-
 @pytest.mark.slow
 def test_single_precision_is_no_worse_than_that_of_mjx():
     args = states(load("inverted_pendulum")[0])

@@ -1,8 +1,6 @@
 """Rollouts against a loop by hand, on a task that counts its steps."""
 
 import functools
-import types
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +10,6 @@ from players import only_active
 from toys import Chain, Toy, ToyState, categorical
 
 from mjx_reinforce.engine.play import counter, episode, rollouts
-from mjx_reinforce.engine.play.episode import CHUNK_STEPS
 
 
 class Plain:
@@ -237,75 +234,6 @@ def test_discrete_actions_have_no_last_axis():
     np.testing.assert_array_equal(trajectory.action, np.array([[0], [1], [0]]).repeat(5, axis=1))
     earned = Chain.rewards[[0, 1, 2], [0, 1, 0]]
     np.testing.assert_allclose(trajectory.reward, earned[:, None].repeat(5, axis=1), rtol=1e-6)
-
-
-# -------------------------------------------------------------------------------------------------
-# Loops over time in chunks: how long they run, alone and vmapped over seeds.
-
-NOISY = types.SimpleNamespace(noise=lambda key, shape: jax.random.uniform(key, (*shape, 1)))
-HORIZON = 3 * CHUNK_STEPS
-
-
-class Lives(NamedTuple):
-    """Episodes that live for so many steps; ``alive`` [N]."""
-
-    lives: jax.Array
-    steps: jax.Array
-    alive: jax.Array
-
-
-def record_noise(noise, progress):
-    """Records the noise of each step in which an episode was alive."""
-    times = progress.steps[0] + jnp.arange(len(noise))
-    alive = times[:, None] < progress.lives
-    records = jnp.where(alive, noise[..., 0], 0.0)
-    steps = progress.steps + len(noise)
-    return Lives(progress.lives, steps, steps < progress.lives), records
-
-
-def played(lives, seed=0):
-    lives = jnp.asarray(lives)
-    keys = jax.random.split(jax.random.key(seed), len(lives))
-    begun = Lives(lives, jnp.zeros_like(lives), lives > 0)
-    return episode.play_chunks(record_noise, NOISY, keys, begun, jnp.zeros((HORIZON, len(lives))))
-
-
-def test_the_largest_divisor_and_a_chunk_divides_the_horizon():
-    cases = (1000, 50, 50), (12, 5, 4), (7, 6, 1), (7, 7, 7), (7, 100, 7), (1, 1, 1)
-    for number, at_most, expected in cases:
-        assert episode.largest_divisor(number, at_most) == expected
-    assert [episode.chunk_length(horizon) for horizon in (1000, 37, 53, 200)] == [50, 37, 1, 50]
-
-
-@pytest.mark.parametrize(("lives", "chunks"), [([0, 0], 0), ([3, 50], 1), ([1, 51], 2), ([999], 3)])
-def test_chunks_are_played_until_every_episode_is_over_or_the_time_is_up(lives, chunks):
-    progress, records, simulated = played(lives)
-    assert simulated == chunks * CHUNK_STEPS * len(lives)
-    assert progress.steps.tolist() == [chunks * CHUNK_STEPS] * len(lives)
-    for number, life in enumerate(lives):
-        np.testing.assert_array_equal(records[:, number] != 0, np.arange(HORIZON) < life)
-
-
-def test_each_step_has_noise_of_its_own():
-    _, records, _ = played([HORIZON, HORIZON])
-    assert len(np.unique(records)) == 2 * HORIZON
-
-
-def test_vmapped_seeds_play_as_long_as_one_of_them_needs():
-    """And what each plays is what it would have played alone."""
-    lives = jnp.array([[3, 9], [60, 2]])
-    together = jax.vmap(played)(lives)
-    assert together[2].tolist() == [2 * CHUNK_STEPS * 2] * 2
-    for seed in range(2):
-        np.testing.assert_array_equal(together[1][seed], played(lives[seed])[1])
-
-
-def test_a_loop_runs_while_any_seed_needs_it():
-    def count(limit):
-        return episode.while_any(lambda n: n < limit, lambda n: n + 1, jnp.zeros((), jnp.int32))
-
-    assert count(3) == 3
-    assert jax.vmap(count)(jnp.array([2, 5, 1])).tolist() == [5, 5, 5]  # the body's own affair
 
 
 # -------------------------------------------------------------------------------------------------

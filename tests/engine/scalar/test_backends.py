@@ -16,11 +16,10 @@ from mjx_reinforce.engine.llvm.text import Text
 from mjx_reinforce.engine.play import program
 from mjx_reinforce.engine.play.program import machine_map
 from mjx_reinforce.engine.scalar import scalarized, skippable
-from mjx_reinforce.engine.scalar.backend import Backend
 from mjx_reinforce.engine.scalar.graph import Graph, Limits
 from mjx_reinforce.engine.scalar.nodes import FACTS, Op, conversion, is_constant
 from mjx_reinforce.engine.scalar.passes import simplify
-from mjx_reinforce.engine.scalar.passes.liveness import LiveLoop, accumulators, unread
+from mjx_reinforce.engine.scalar.passes.liveness import LiveLoop, accumulators
 from mjx_reinforce.engine.scalar.vmap import XLA
 
 #: Operands of which every float operation is finite.
@@ -70,7 +69,6 @@ def test_a_backend_walks_loops_and_gates():
     for backend in (
         XLA(lambda place: jnp.linspace(1.0, 2.0, 4), (4,)),
         LLVM(Text(4), lambda number: Input("%input", np.dtype(np.float32))),
-        Listing(),
     ):
         assert written.compile(backend)
 
@@ -132,99 +130,6 @@ def test_operations_that_commute_are_shared():
 def test_equal_operations_are_equal():
     float32, int32 = np.dtype(np.float32), np.dtype(np.int32)
     assert len({conversion(float32), conversion(float32), conversion(int32)}) == 2
-
-
-class Listing(Backend[str]):
-    """Writes a program out as text, one statement a line."""
-
-    def __init__(self):
-        self.lines = []
-
-    def constant(self, number):
-        return f"{number:g}"
-
-    def leaf(self, node):
-        return f"x{node.position[1]}"
-
-    def node(self, node, operands):
-        return self.assign(f"{node.op.name}({', '.join(operands)})")
-
-    def gate(self, gate, values):
-        cold = [self.value(out.cold, values) for out in gate.outs]
-        self.lines.append(f"if any {self.value(gate.predicate, values)}")
-        inner = self.inside(gate.body, values)
-        hot = [self.value(out.hot, inner) for out in gate.outs]
-        return [self.assign(f"{on} else {off}") for on, off in zip(hot, cold, strict=True)]
-
-    def loop(self, loop, values):
-        starts = [self.assign(self.value(carry.init, values)) for carry in loop.carries]
-        rows = [[self.value(x, values) for x in element.values] for element in loop.elements]
-        self.lines.append(f"repeat {loop.length}")
-        known = {c.leaf: start for c, start in zip(loop.carries, starts, strict=True)}
-        known.update(
-            {e.leaf: f"[{' '.join(row)}]" for e, row in zip(loop.elements, rows, strict=True)}
-        )
-        inner = self.inside(loop.body, values, known)
-        ends = [self.value(carry.next, inner) for carry in loop.carries]
-        kept = [self.value(record.value, inner) for record in loop.records]
-        self.lines.append(f"next {' '.join(ends)}")
-        return ends, [
-            [f"{y}[{t}]" for t in range(len(record.outs))]
-            for y, record in zip(kept, loop.records, strict=True)
-        ]
-
-    def result(self, outputs):
-        return [*self.lines, *(f"return {' '.join(leaf)}" for leaf in outputs)]
-
-    def assign(self, text):
-        name = f"v{sum(' = ' in line for line in self.lines)}"
-        self.lines.append(f"{name} = {text}")
-        return name
-
-
-def listing(fn, *args, **kwargs):
-    return scalar.scalarize(fn, *args, **kwargs).compile(Listing())
-
-
-def test_a_backend_of_arithmetic():
-    assert listing(lambda x: (x[0] * 2 + x[1], x[1]), jnp.ones(2)) == [
-        "v0 = mul(x0, 2)",
-        "v1 = add(v0, x1)",
-        "return v1",
-        "return x1",
-    ]
-
-
-def test_a_backend_gets_only_what_is_needed_of_a_loop():
-    def fn(x):
-        def body(carry, row):
-            y, unused = carry
-            return (y * row, jnp.exp(unused)), (y, unused)
-
-        (y, _), (kept, _) = lax.scan(body, (x, x), jnp.arange(2.0, 8.0))
-        return y, kept[1]
-
-    assert listing(fn, 1.0) == [
-        "v0 = x0",
-        "repeat 6",
-        "v1 = mul(v0, [2 3 4 5 6 7])",
-        "next v1",
-        "return v1",
-        "return v0[1]",
-    ]
-
-
-def test_a_backend_gets_a_gate_for_an_expensive_branch():
-    fn = lambda x: lax.cond(x > 0, lambda: jnp.sin(jnp.cos(x)), lambda: x)  # noqa: E731
-    assert listing(fn, 1.0, branch_cost=1) == [
-        "v0 = gt(x0, 0)",
-        "if any v0",
-        "v1 = cos(x0)",
-        "v2 = sin(v1)",
-        "v3 = select_n(v0, x0, v2)",
-        "v4 = v3 else x0",
-        "return v4",
-    ]
 
 
 def test_operations_are_counted_inside_loops_and_branches():
@@ -391,29 +296,3 @@ def test_what_is_read_elsewhere_does_not(between):
         others = [id(other.next) for other in loop.carries if other is not carry]
         assert id(carry.leaf) not in changed or id(carry.leaf) not in others
     assert len(changed) < len(loop.carries)
-
-
-@pytest.mark.cpu
-def test_what_is_selected_does_not():
-    def add(total, weight):
-        return lax.cond(weight > 0, lambda: total + jnp.sin(weight * ROWS[0]), lambda: total), None
-
-    (loop,) = loops_of(lambda weights: lax.scan(add, jnp.ones((4, SIZE)), weights)[0])
-    assert loop.carries
-    assert not accumulators(loop)
-
-
-@pytest.mark.cpu
-def test_carries_that_the_body_does_not_read():
-    """A cosine, four records of the inner loop; the angle and what is counted are read."""
-    outer = loops_of(never_read)[-1]
-    assert len(unread(outer)) == 5
-    assert len(outer.carries) == 7
-    starts = {carry.leaf: carry.init for carry in outer.carries}
-    assert all(starts[leaf] == 0 for leaf in unread(outer))  # nothing reads them
-
-
-@pytest.mark.cpu
-def test_a_loop_that_may_not_run_has_its_starts():
-    (loop,) = loops_of(ends_early)
-    assert sorted(float(c.init) for c in loop.carries if not hasattr(c.init, "op")) == [9.0]

@@ -332,8 +332,8 @@ PROGRAMS = st.builds(
 )
 
 
-@pytest.mark.parametrize("examples", [5, pytest.param(24, marks=pytest.mark.slow)])
-def test_random_programs_compute_what_jax_computes(examples):
+@pytest.mark.slow
+def test_random_programs_compute_what_jax_computes():
     rng = np.random.default_rng(0)
     x = jnp.asarray(rng.integers(-64, 65, BATCH) / 8, jnp.float32)
     v = jnp.asarray(rng.integers(-64, 65, (BATCH, SIZE)) / 8, jnp.float32)
@@ -341,7 +341,7 @@ def test_random_programs_compute_what_jax_computes(examples):
     tried, compared = [], []
 
     @settings(
-        max_examples=examples,
+        max_examples=16,
         deadline=None,
         derandomize=True,
         database=None,
