@@ -4,8 +4,6 @@ import dataclasses
 import functools
 import inspect
 import json
-import subprocess
-import sys
 
 import gymnasium
 import jax
@@ -39,13 +37,9 @@ HEAVY = {
     *("Pusher-v5", "Swimmer-v5", "HalfCheetah-v5", "Hopper-v5"),
     *("Walker2d-v5", "Ant-v5", "Humanoid-v5", "HumanoidStandup-v5"),
 }
-#: Tasks of the same classes as others, with other numbers.
-OLDER = {"InvertedPendulum-v4", "CartPole-v0"}
-#: Tasks whose steps are those of Hopper and Humanoid, with other formulas: test_tasks.py has these.
-ALIKE = {"Walker2d-v5", "HumanoidStandup-v5"}
+#: Tasks whose steps are those of others, with other numbers and formulas: see test_tasks.py.
+ALIKE = HEAVY - {"Humanoid-v5"} | {"InvertedPendulum-v4", "CartPole-v0"}
 LIGHT = sorted(set(IDS) - HEAVY)
-#: Tasks that take seconds to trace or to compile.
-SECONDS = HEAVY - {"Swimmer-v5"} | {"Reacher-v5", "InvertedDoublePendulum-v5"}
 made = functools.cache(envs.make)
 all_in_turn = pytest.mark.parametrize(
     "ids", [LIGHT, pytest.param(sorted(HEAVY), marks=pytest.mark.slow)], ids=["light", "heavy"]
@@ -60,8 +54,8 @@ def shapes(tree):
 @pytest.mark.parametrize(
     "id",
     [
-        pytest.param(id, marks=pytest.mark.slow) if id in SECONDS else id
-        for id in sorted(set(IDS) - OLDER - ALIKE)
+        pytest.param(id, marks=pytest.mark.slow) if id in HEAVY else id
+        for id in sorted(set(IDS) - ALIKE)
     ],
 )
 def test_a_step_keeps_shapes_and_dtypes_and_its_argument(id):
@@ -247,36 +241,6 @@ def test_register_once():
             envs.register("Again-v0", envs.make)
     finally:
         del envs._TABLE["Again-v0"]
-
-
-_THREADS = """
-import sys, threading
-from mjx_reinforce import envs
-stdout, seen, ended = sys.stdout, set(), threading.Event()
-def look():
-    while not ended.is_set():
-        seen.add(sys.stdout)
-watcher = threading.Thread(target=look)
-watcher.start()
-names = ["InvertedPendulum-v5", "CartPole-v1"] * 2
-makers = [threading.Thread(target=envs.make, args=(name,)) for name in names]
-for thread in makers:
-    thread.start()
-for thread in makers:
-    thread.join()
-ended.set()
-watcher.join()
-print(seen == {stdout}, sys.stdout is stdout)
-"""
-
-
-@pytest.mark.slow
-def test_threads_that_make_environments_leave_standard_output_alone():
-    """Nor do they print: what MJX says of its Warp backend is not heard."""
-    done = subprocess.run(
-        [sys.executable, "-c", _THREADS], check=True, capture_output=True, text=True, timeout=100
-    )
-    assert done.stdout == "True True\n"
 
 
 # -------------------------------------------------------------------------------------------------

@@ -81,7 +81,6 @@ class Reach(Box):
         return -jnp.abs(away) + 0 * before.episode["goal"], jnp.abs(away) > 3, {}
 
 
-@pytest.mark.slow
 def test_a_model_may_be_a_file_a_spec_or_a_model(tmp_path):
     path = tmp_path / "box.xml"
     path.write_text(SOURCE)
@@ -90,8 +89,7 @@ def test_a_model_may_be_a_file_a_spec_or_a_model(tmp_path):
         env = Box(xml_file=source)
         assert env.mj_model is not MODEL
         assert env.mj_model.nq == 3
-        after = jax.jit(lambda key, env=env: env.step(env.reset(key), jnp.ones(1)))
-        seen.append(after(jax.random.key(0)).obs)
+        seen.append(np.concatenate([env.mj_model.body_mass, env.mj_model.geom_size.ravel()]))
         if source is not MODEL:
             assert models.spec(env.settings.xml_file).compile().nq == 3
     np.testing.assert_array_equal(seen[0], seen[2])

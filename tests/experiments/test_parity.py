@@ -84,7 +84,7 @@ def test_equals_gymnasium(id):
 
 @pytest.mark.parametrize("id", SMALL)
 def test_machine_code_equals_gymnasium(id):
-    """Tasks with contacts are held to the same physics in ``test_native_contacts.py``."""
+    """Tasks with contacts are held to the same physics in ``tests/engine/play/test_mapping.py``."""
     with jax.enable_x64(True):
         if reason := available.unavailable():
             pytest.skip(reason)

@@ -59,8 +59,10 @@ def returns_by_hand(discount):
     return returns[:4]
 
 
-@pytest.mark.parametrize(("dtype", "within"), [(np.float64, 1e-12), (np.float32, 1e-5)])
-@pytest.mark.parametrize("horizon", [1, 2, 3, 36, 37, 1000])
+@pytest.mark.parametrize(
+    ("horizon", "dtype", "within"),
+    [(1, np.float64, 1e-12), (36, np.float64, 1e-12), (37, np.float32, 1e-5)],
+)
 def test_returns_to_go_are_those_of_the_recurrence(horizon, dtype, within):
     reward = np.random.default_rng(horizon).normal(1.0, 1.0, (horizon, 2)).astype(dtype)
     discounts = [0, 0.5, 0.995, 1]
@@ -115,19 +117,6 @@ def test_full_batch_value_baseline_by_hand():
     params = after.params["params"]
     assert float(params["kernel"][0, 0]) == pytest.approx(slope, rel=1e-5)
     assert float(params["bias"][0]) == pytest.approx(bias, rel=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("make", "more"),
-    [
-        (full_batch_value_baseline, {"num_fits": 10}),
-        (value_baseline, {"horizon": 1000, "num_fits": 32, "batch_size": 256}),
-    ],
-)
-def test_the_defaults_of_critics_are_as_documented(make, more):
-    explicit = make(0.99, network=MLP((64, 64), 1), optimizer=optax.adam(3e-3), **more)
-    assert_equal(update(make(), make_trajectory()), update(explicit, make_trajectory()))
 
 
 def test_the_critics_optimizer_keeps_its_state_and_sees_the_parameters():
@@ -192,14 +181,6 @@ def test_equal_returns_leave_nothing_to_explain(level):
     assert np.isnan(explained)
 
 
-@pytest.mark.parametrize("make", [est.leave_one_out, est.leave_one_out_alive])
-def test_the_variance_that_leave_one_out_explains_by_hand(make):
-    weight, _, metrics = update(make(0.9), make_trajectory())
-    left, returns = np.asarray(weight)[MASK], returns_by_hand(0.9)[MASK]
-    expected = 1 - np.var(left) / np.var(returns)
-    assert float(metrics["explained_variance"]) == pytest.approx(expected, rel=1e-5)
-
-
 def test_a_perfect_baseline_explains_all_and_a_constant_nothing():
     returns, mask = jnp.asarray(REWARD), jnp.asarray(MASK)
     zero = jnp.where(mask, 0.0, 7.0)
@@ -241,11 +222,6 @@ def test_a_shift_is_taken_off_the_reward_of_every_step_and_of_no_other():
     np.testing.assert_allclose(got, raw - 0.5 * left, rtol=1e-6)
 
 
-def test_no_shift_leaves_every_bit():
-    plain, same = est.leave_one_out(0.9), est.shift_rewards(est.leave_one_out(0.9), 0.0)
-    assert_equal(update(same, make_trajectory()), update(plain, make_trajectory()))
-
-
 @pytest.mark.parametrize("wrap", [est.standardize, est.discount_weights, shift])
 def test_wrapping_keeps_what_an_estimator_requires_learns_and_measures(wrap):
     inner = value_baseline(0.9)
@@ -260,14 +236,12 @@ def test_wrapping_keeps_what_an_estimator_requires_learns_and_measures(wrap):
 
 
 @pytest.mark.parametrize(
-    "make", [*MAKERS.values(), functools.partial(est.discount_weights, est.reward_to_go())]
+    ("name", "wrap"),
+    [
+        *((name, lambda e: e) for name in sorted(MAKERS)),
+        *(("value-baseline", wrap) for wrap in (est.standardize, est.discount_weights, shift)),
+    ],
 )
-def test_the_default_discount_is_099(make):
-    assert_equal(weights(make(), make_trajectory()), weights(make(0.99), make_trajectory()))
-
-
-@pytest.mark.parametrize("wrap", [lambda e: e, est.standardize, est.discount_weights, shift])
-@pytest.mark.parametrize("name", sorted(MAKERS))
 def test_nothing_after_the_end_has_any_effect_on_the_weights(name, wrap):
     """A normalised observation behind the end may be anything: no weight reads it."""
     estimator = wrap(MAKERS[name](0.9))
@@ -329,8 +303,7 @@ def test_what_a_broken_episode_earned_has_no_effect(name):
     assert_equal(update(estimator, rich), update(estimator, trajectory))
 
 
-@pytest.mark.parametrize("sign", [1, -1])
-@pytest.mark.parametrize("which", range(3))
+@pytest.mark.parametrize(("which", "sign"), [(0, 1), (1, -1), (2, 1)])
 @pytest.mark.parametrize("name", sorted(MAKERS))
 def test_a_broken_episode_is_the_worst(name, which, sign):
     """At every step; the critic is of zeros."""

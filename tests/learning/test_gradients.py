@@ -17,7 +17,7 @@ def loss(params, chunk):
 PARAMS = {"w": jnp.array(0.7)}
 
 
-@pytest.mark.parametrize("longest", [0, 1, 5, 6, 254, 256])
+@pytest.mark.parametrize("longest", [0, 6, 254, 256])
 def test_the_sum_is_over_every_step_and_chunks_after_the_end_are_skipped(longest):
     """256 steps are two chunks of 128; in a chunk that is visited, NaN would reach the gradient."""
     lengths = np.array([longest, longest // 2])

@@ -13,8 +13,7 @@ from brax import envs as brax_envs
 from toys import Drifting, SignedTarget, Survive
 
 from mjx_reinforce import Cut, ars, mlp_policy, normal, reinforce, train_step
-from mjx_reinforce.engine.play import available
-from mjx_reinforce.learning import counts, estimators, updates
+from mjx_reinforce.learning import counts, estimators
 from mjx_reinforce.learning import learner as learner_module
 from mjx_reinforce.learning.estimators import discounted_returns
 from mjx_reinforce.learning.value import value_baseline
@@ -191,10 +190,7 @@ def test_a_gradient_that_is_not_finite_is_skipped():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("length", "update"), [(51, updates.full_batch()), (50, variants.each_step())]
-)
-def test_short_episodes_are_learned_from_in_short(length, update, monkeypatch):
+def test_short_episodes_are_learned_from_in_short(monkeypatch):
     """Of 400 steps at most, where no episode took more than 50: the same, up to rounding."""
 
     class Ends(Survive):
@@ -205,13 +201,13 @@ def test_short_episodes_are_learned_from_in_short(length, update, monkeypatch):
 
         def step(self, state, action):
             count = state.info + 1.0
-            done = (count >= length).astype(jnp.float32)
+            done = (count >= 50).astype(jnp.float32)
             return state.replace(reward=jnp.cos(action[0] + count), done=done, info=count)
 
     learned, branches = [], []
     for many in (2 * 3 * 400, 2 * 3 * 400 + 1):
         monkeypatch.setattr(wrappers, "_MANY", many)
-        settings = {"update": update, "optimizer": optax.sgd(1.0), "engine": "vmap"}
+        settings = {"optimizer": optax.sgd(1.0), "engine": "vmap"}
         learner = reinforce(Ends(), num_episodes=3, **settings)
         learner = wrappers.short_episodes(learner, Ends.max_episode_steps, num_seeds=2)
         seeds = jax.jit(jax.vmap(learner.init))(jax.random.split(jax.random.key(0), 2))
@@ -224,13 +220,10 @@ def test_short_episodes_are_learned_from_in_short(length, update, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("engine", "short_apart"), [("vmap", True), ("native", False)])
-def test_episodes_are_cut_until_a_share_of_the_budget_is_used(engine, short_apart, monkeypatch):
+def test_episodes_are_cut_until_a_share_of_the_budget_is_used(monkeypatch):
     """An update learns what one does whose episodes all have that horizon."""
-    if engine == "native" and (reason := available.unavailable()):
-        pytest.skip(reason)
-    monkeypatch.setattr(wrappers, "_MANY", 0 if short_apart else 2**31)
-    settings = {"num_episodes": 8, "engine": engine}
+    monkeypatch.setattr(wrappers, "_MANY", 0)
+    settings = {"num_episodes": 8, "engine": "vmap"}
     settings["policy"] = mlp_policy(2, normal(Drifting.action_space), ())
     cut = wrappers.short_episodes(reinforce(Drifting(), horizon=100, **settings), 100, 1, 50)
     cut = Cut(steps=50, until=0.5)(cut)

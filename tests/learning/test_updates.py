@@ -193,8 +193,10 @@ def clock(progress=0.0, env_steps=0.0):
     return updates.Clock(jnp.asarray(progress), jnp.asarray(env_steps))
 
 
-@pytest.mark.parametrize("name", UPDATES)
-@pytest.mark.parametrize("length", [None, 10])
+@pytest.mark.parametrize(
+    ("name", "length"),
+    [("full-batch", None), ("full-batch", 10), ("minibatches", None), ("each-step", 10)],
+)
 def test_the_rate_falls_with_the_budget_or_with_env_steps(name, length):
     """All optimiser steps of an update have the rate of its beginning."""
     plain = updates.make_optimizer("sgd", 0.1, max_grad_norm=None)
@@ -227,7 +229,7 @@ def test_the_std_shrinks_with_the_budget_besides_what_is_learned():
     np.testing.assert_allclose(total, [0.5 * np.log(0.1)] * 2, rtol=1e-5)
 
 
-@pytest.mark.parametrize("budget", [10**6, 10**12, 2**53])
+@pytest.mark.parametrize("budget", [10**6, 2**53])
 def test_schedules_are_exact_for_budgets_of_any_size(budget):
     """Shares of counts in two words, and the std after 10,000 updates however small each is."""
     limit = counts.from_int(budget)

@@ -20,10 +20,6 @@ from mjx_reinforce.statistics import (
 )
 
 
-def test_iqm_is_the_mean_of_the_middle_half():
-    assert iqm(np.array([1000.0, 3.0, 1.0, 2.0, -50.0, 4.0, 5.0, 6.0])) == pytest.approx(3.5)
-
-
 @pytest.mark.parametrize(
     ("values", "expected"),
     [
@@ -118,30 +114,12 @@ CURVES = {
 }
 
 
-@pytest.mark.parametrize("num_seeds", [2, 3, 4, 5, 7, 16, 101, 222])
+@pytest.mark.parametrize("num_seeds", [2, 5, 222])
 @pytest.mark.parametrize("kind", CURVES)
 def test_resamples_are_those_of_scipy(kind, num_seeds):
     values = CURVES[kind](np.random.default_rng(num_seeds), num_seeds)
     found = bootstrap.percentiles(bootstrap.resampled_trim_means(values, 0.25), 0.025)
     np.testing.assert_allclose(found, by_scipy(values, 0.025), rtol=1e-12, atol=1e-13)
-
-
-@pytest.mark.parametrize(("setting", "value"), [("_AT_ONCE", 700), ("_DRAWS", 3000)])
-def test_interval_does_not_depend_on_how_it_is_computed(monkeypatch, setting, value):
-    """Resamples may come in parts."""
-    values = np.random.default_rng(2).exponential(size=(4, 150))
-    expected = iqm_interval(values)
-    monkeypatch.setattr(bootstrap, setting, value)
-    for table in (bootstrap.draws, bootstrap._draws_between):
-        table.cache_clear()
-    np.testing.assert_allclose(iqm_interval(values), expected, rtol=1e-12)
-
-
-def test_interval_has_the_shape_of_the_other_axes():
-    values = np.random.default_rng(2).normal(size=(2, 9, 3))
-    low, high = iqm_interval(values, axis=1)
-    assert low.shape == high.shape == (2, 3)
-    np.testing.assert_array_equal([low[1, 2], high[1, 2]], iqm_interval(values[1, :, 2]))
 
 
 @pytest.mark.parametrize("failed", [np.nan, np.inf, -np.inf])
