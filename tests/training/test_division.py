@@ -23,8 +23,6 @@ VARIANTS = {
     "value": ("step", {"estimator": "value-baseline"}, {"episodes": 8}),
     "natural": ("step", {"update": "natural-gradient", "max_kl": 0.01}, {"episodes": 8}),
     "minibatches": ("step", {"algorithm": "continuous-cartpole"}, {"episodes": 2}),
-    "one start": ("step", {"algorithm": "gymnasium-tutorial"}, {"episodes": 2}),
-    "vmap": ("step", {"engine": "vmap", "algorithm": "categorical-cartpole"}, {"episodes": 2}),
 }
 
 
