@@ -53,6 +53,8 @@ class Sizes(NamedTuple):
     few: tuple[int, ...] = ()
 
 
+#: A task of a user's own.
+QUADRUPED = "experiments.examples.quadruped:Quadruped"
 #: What stands first is timed first, and so kept where a call is cut off.
 GPU = {
     "InvertedPendulum-v5": Sizes(262_144, 200, (16_384, 65_536), 50, (32_768, 131_072)),
@@ -67,20 +69,15 @@ GPU = {
     "CartPole-v1": Sizes(262_144, 200, warp=()),
     "Humanoid-v5": Sizes(33_792, 100, few=(2_048,)),
     "HumanoidStandup-v5": Sizes(33_792, 100, few=(2_048,)),
+    QUADRUPED: Sizes(33_792, 200, few=(2_048,)),
 }
 #: Episodes and env steps of native's on two cores.
 CPU = {
     "InvertedPendulum-v5": (8_192, 100),
-    "Hopper-v5": (2_048, 20),
-    "HalfCheetah-v5": (2_048, 20),
-    "Walker2d-v5": (2_048, 20),
-    "Ant-v5": (512, 20),
-    "Humanoid-v5": (512, 20),
-    "HumanoidStandup-v5": (512, 20),
+    **dict.fromkeys(("Hopper-v5", "HalfCheetah-v5", "Walker2d-v5"), (2_048, 20)),
+    **dict.fromkeys(("Ant-v5", "Humanoid-v5", "HumanoidStandup-v5", QUADRUPED), (512, 20)),
     "Pusher-v5": (2_048, 20),
-    "Reacher-v5": (2_048, 50),
-    "Swimmer-v5": (2_048, 50),
-    "InvertedDoublePendulum-v5": (2_048, 50),
+    **dict.fromkeys(("Reacher-v5", "Swimmer-v5", "InvertedDoublePendulum-v5"), (2_048, 50)),
 }
 #: The task that also shows the engines beside native on a CPU.
 SHOWN_ON_CPU = "InvertedPendulum-v5"

@@ -17,11 +17,8 @@ from mjx_reinforce.engine.play.choice import ActingPolicy, choose
 from mjx_reinforce.learning import normalize
 from mjx_reinforce.learning.distributions import default_distribution
 
-#: Name in the table -> engine, and the solver of the environment's physics.
-ENGINES = {
-    "plain MJX": ("vmap", "mjx"),
-    "native": ("native", "exact"),
-}
+#: Name in the table -> engine, and arguments of the environment.
+ENGINES = {"plain MJX": ("vmap", {"solver": "mjx"}), "native": ("native", {})}
 
 
 @struct.dataclass
@@ -67,8 +64,8 @@ def rollout_of(
     env_id: str, name: str, steps: int, precision: str = "float32"
 ) -> Callable[[int], Candidate]:
     """Makes the machine code of a rollout; returns what compiles a program of so many episodes."""
-    engine_name, solver = ENGINES[name]
-    env = Loop(make(env_id, solver), steps)
+    engine_name, arguments = ENGINES[name]
+    env = Loop(envs.make(env_id, **arguments), steps)
     size = observation_size(env)
     network = mlp_policy(size, default_distribution(action_space(env)), (16, 32))
     actor = Actor(params=network.init(jax.random.key(0)), normalizer=normalize.init(size))
@@ -92,8 +89,8 @@ def rollout_of(
 
 def training(env_id: str, name: str, batch: int, steps: int) -> Candidate:
     """Whole updates of a 64-64 policy in float32: rollout, estimator, gradient and optimiser."""
-    engine_name, solver = ENGINES[name]
-    env = Loop(make(env_id, solver), steps)
+    engine_name, arguments = ENGINES[name]
+    env = Loop(envs.make(env_id, **arguments), steps)
     policy = mlp_policy(observation_size(env), default_distribution(action_space(env)), (64, 64))
     began = time.perf_counter()
     learner = reinforce(env, policy=policy, num_episodes=batch, engine=engine_name)
@@ -111,12 +108,6 @@ def training(env_id: str, name: str, batch: int, steps: int) -> Candidate:
     }
     row |= {"batch": batch, "steps": steps}
     return compiled(row, update, state, batch * steps, choosing)
-
-
-def make(env_id: str, solver: str) -> Any:
-    """Builds an environment; one without a MuJoCo model has no solver."""
-    env = envs.make(env_id)
-    return envs.make(env_id, solver=solver) if hasattr(env, "mj_model") else env
 
 
 def compiled(

@@ -14,20 +14,8 @@ from experiments.kit.places import DOCS
 #: Where the tables and the figure of the documents find their numbers.
 RAW = DOCS / "benchmarks.csv"
 COLUMNS: tuple[str, ...] = (
-    "date",
-    "commit",
-    "machine",
-    "device",
-    "jax",
-    "task",
-    "what",
-    "engine",
-    "precision",
-    "batch",
-    "steps",
-    "settings",
-    "compile_seconds",
-    "env_steps_per_second",
+    *("date", "commit", "machine", "device", "jax", "task", "what", "engine", "precision"),
+    *("batch", "steps", "settings", "compile_seconds", "env_steps_per_second"),
 )
 
 

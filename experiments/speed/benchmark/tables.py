@@ -19,7 +19,7 @@ PAGES = (ROOT / "README.md", DOCS / "benchmarks.md")
 FEW = ("InvertedPendulum-v5", "Reacher-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5")
 OTHERS = (
     *("InvertedDoublePendulum-v5", "Swimmer-v5", "Pusher-v5", "Humanoid-v5"),
-    *("HumanoidStandup-v5", "CartPole-v1"),
+    *("HumanoidStandup-v5", "experiments.examples.quadruped:Quadruped", "CartPole-v1"),
 )
 
 
@@ -161,19 +161,14 @@ def gpu(raw: Raw) -> str:
     for task in tasks_of(raw.gpu):
         native, warp = best(raw.gpu, task, "native"), best(raw.gpu, task, "MuJoCo Warp")
         plain, c_mujoco = best(raw.gpu, task, "plain MJX"), best(raw.gpu, task, "C MuJoCo")
-        cells = (rate(native), at(native), rate(warp), at(warp), ratio(native, warp))
+        cells = (task.rpartition(":")[2], rate(native), at(native), rate(warp), at(warp))
         training = best(raw.train, task, "native")
-        rows.append((task, *cells, rate(plain), at(plain), rate(c_mujoco), rate(training)))
+        rows.append(
+            (*cells, ratio(native, warp), rate(plain), at(plain), rate(c_mujoco), rate(training))
+        )
     header = (
-        "task",
-        "native",
-        "episodes x steps",
-        "MuJoCo Warp",
-        "worlds x steps",
-        "native / Warp",
-        "plain MJX",
-        "its episodes x steps",
-        "C MuJoCo, all threads, float64",
+        *("task", "native", "episodes x steps", "MuJoCo Warp", "worlds x steps", "native / Warp"),
+        *("plain MJX", "its episodes x steps", "C MuJoCo, all threads, float64"),
         "training, native, 64-64",
     )
     return f"{origin(raw.gpu + raw.train)}\n\n{table(header, rows)}"
@@ -187,16 +182,10 @@ def cpu(raw: Raw) -> str:
         c_mujoco, gymnasium = (best(raw.cpu, task, x) for x in ("C MuJoCo", "Gymnasium"))
         cells = (at(single), rate(single), rate(double), rate(c_mujoco))
         ratios = (ratio(double, c_mujoco), ratio(single, c_mujoco))
-        rows.append((task, *cells, *ratios, rate(gymnasium)))
+        rows.append((task.rpartition(":")[2], *cells, *ratios, rate(gymnasium)))
     header = (
-        "task",
-        "episodes x steps",
-        "native, float32",
-        "native, float64",
-        "C MuJoCo, float64",
-        "float64 / C",
-        "float32 / C",
-        "Gymnasium",
+        *("task", "episodes x steps", "native, float32", "native, float64", "C MuJoCo, float64"),
+        *("float64 / C", "float32 / C", "Gymnasium"),
     )
     return f"{origin(raw.cpu)}\n\n{table(header, rows)}"
 

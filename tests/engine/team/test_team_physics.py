@@ -1,7 +1,7 @@
 """The device code of the physics, compiled with one lane in float64, beside C MuJoCo.
 
-``python tests/engine/team/test_physics.py humanoid 10000`` prints the largest error of an env step
-from so many states of a task's random play.
+``python tests/engine/team/test_team_physics.py humanoid 10000`` prints the largest error of an env
+step from so many states of a task's random play.
 """
 
 import ctypes
@@ -30,6 +30,7 @@ needs_compiler = pytest.mark.skipif(_COMPILER is None, reason="there is no C++ c
 #: What a step is compared on, and how many numbers each has of a body.
 _OF_BODIES = {"xpos": 3, "xipos": 3, "cinert": 10, "cvel": 6, "cfrc_ext": 6}
 
+_OWN = str(Path(__file__).parents[3] / "experiments" / "examples" / "quadruped")
 _MODELS = tomllib.loads((Path(__file__).parent / "models.toml").read_text("utf-8"))
 _MANY = '<geom size=".1"/>'
 _REFUSED = {
@@ -103,9 +104,7 @@ def _error(m: Any, play: Any, data: Any, skip: int) -> float:
     return max(errors)
 
 
-def _largest_error(
-    m: Any, folder: Any, skip: int, starts: int, near: int = tables.NEAR, lanes: int = 1
-) -> float:
+def _largest_error(m: Any, folder: Any, skip: int, starts: int, near=tables.NEAR, lanes=1):
     """Returns the largest error of steps along short episodes of random play."""
     play = _compiled(_exact(m), folder, near, lanes)
     rng, errors = np.random.default_rng(0), []
@@ -122,7 +121,7 @@ def _largest_error(
 
 @needs_compiler
 @pytest.mark.slow
-@pytest.mark.parametrize("task", ["half_cheetah", "ant", "humanoid", "humanoid_standup"])
+@pytest.mark.parametrize("task", ["half_cheetah", "ant", "humanoid", "humanoid_standup", _OWN])
 def test_tasks(task, tmp_path):
     m = models.load_model(f"{task}.xml")
     assert _largest_error(m, tmp_path, skip=5, starts=2) < 1e-9
