@@ -5,10 +5,9 @@ entries, A action entries.
 """
 
 import contextlib
-import contextvars
 import dataclasses
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, Self, TypeAlias
 
 import jax
@@ -193,35 +192,27 @@ def null_action(env: Environment) -> np.ndarray:
     return np.zeros(env.action_size, np.float32)
 
 
-#: The operations that were called so far, where they are kept whole.
-_WHOLE = contextvars.ContextVar[list[tuple[str, Any]] | None]("whole", default=None)
+#: JAX keeps what it traced with one value of this apart from what it traced with another.
+_WHOLE = jax.make_user_context(False)
 
 
-@contextlib.contextmanager
-def keeping_whole() -> Iterator[list[tuple[str, Any]]]:
-    """Has an environment that is traced within call ``scalar.whole`` for its physics.
-
-    It yields what was called: names, and the environments whose physics it is. JAX keeps what it
-    has traced: give it a new function.
-    """
-    called: list[tuple[str, Any]] = []
-    token = _WHOLE.set(called)
-    try:
-        yield called
-    finally:
-        _WHOLE.reset(token)
+def keeping_whole() -> contextlib.AbstractContextManager[None]:
+    """Has an environment that is traced within call ``scalar.whole`` for its physics."""
+    return _WHOLE(True)
 
 
 def is_kept_whole() -> bool:
     """Returns whether an operation that a backend may know is to stay whole."""
-    return _WHOLE.get() is not None
+    return _WHOLE.value
 
 
-def note_whole(name: str, owner: Any) -> None:
-    """Notes that an operation stays whole."""
-    called = _WHOLE.get()
-    assert called is not None
-    called.append((name, owner))
+def shapes(function: Callable[..., Any], *args: PyTree) -> Any:
+    """Returns ``jax.eval_shape`` of what calls an environment, whose physics is not traced."""
+    try:
+        with keeping_whole():
+            return jax.eval_shape(function, *args)
+    except Exception:  # it differentiates its physics, say; or it is wrong, which this says
+        return jax.eval_shape(function, *args)
 
 
 def observation_size(env: Environment) -> int:
@@ -230,7 +221,7 @@ def observation_size(env: Environment) -> int:
     Raises:
       ValueError: the observation is not one vector.
     """
-    obs = jax.eval_shape(env.reset, jax.random.key(0)).obs
+    obs = shapes(env.reset, jax.random.key(0)).obs
     if not hasattr(obs, "shape") or len(obs.shape) != 1:
         raise ValueError(
             f"the observation must be one vector, this environment's is {obs}; "

@@ -9,7 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.engine import checks
-from mjx_reinforce.engine.base import Act, Acts, Box, Discrete, Environment, PyTree, action_space
+from mjx_reinforce.engine.base import (
+    Act,
+    Acts,
+    Box,
+    Discrete,
+    Environment,
+    PyTree,
+    action_space,
+    shapes,
+)
 from mjx_reinforce.engine.checks import BadEnvironmentError, require
 
 #: What JAX raises where Python or NumPy asks for the value of a traced array.
@@ -108,7 +117,7 @@ def _are_bounds(space: Box, size: int) -> bool:
 def _shapes(name: str, what: str, function: Callable[..., Any], *arguments: PyTree) -> Any:
     """Returns the shapes of what a method returns."""
     try:
-        return jax.eval_shape(function, *arguments)
+        return shapes(function, *arguments)
     except BadEnvironmentError:
         raise
     except (Exception, SystemExit) as error:  # it is the user's code, which may raise anything

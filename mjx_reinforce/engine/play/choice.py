@@ -284,7 +284,7 @@ def rollout(
     check_key(key)
     check_count("num_episodes", num_episodes)
     check_count("horizon", horizon)
-    check_policy(act, actor, distribution, jax.eval_shape(env.reset, jax.random.key(0)).obs)
+    check_policy(act, actor, distribution, base.shapes(env.reset, jax.random.key(0)).obs)
     policy = ActingPolicy(act, actor, distribution)
     play = _rollout_of(engine, env, policy, horizon)
     options: dict[str, Any] = {"deterministic": deterministic, "active": active}
@@ -296,7 +296,7 @@ def _rollout_of(engine: str, env: Environment, policy: ActingPolicy, horizon: in
     """Returns the rollout of an engine."""
     large = sum(np.size(x) for x in jax.tree.leaves(policy.actor)) > _MOST_PARAMETERS
     if engine == "auto" and large and available.platform() == "cpu":
-        examples = jax.eval_shape(env.reset, jax.random.key(0)), base.null_action(env)
+        examples = base.shapes(env.reset, jax.random.key(0)), base.null_action(env)
         step = machine_code(env, env.step, *examples)
         if not isinstance(step, str):
             return functools.partial(rollouts.rollout, env_step=_episodes_last(step))

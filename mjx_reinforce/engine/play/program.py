@@ -71,8 +71,7 @@ def step_function(
       distribution: the family whose parameters the outputs are.
       length: steps whose noise is drawn with one key, as ``chunks.play_chunks`` does.
     """
-    shapes = jax.eval_shape(env.reset, jax.random.key(0))
-    leaves, tree = jax.tree.flatten(shapes)
+    leaves, tree = jax.tree.flatten(base.shapes(env.reset, jax.random.key(0)))
     drawn = jax.eval_shape(lambda: distribution.noise(jax.random.key(0), ()))
     words = int(np.prod(drawn.shape, dtype=int))  # random ones that the noise of a step takes
 
@@ -109,9 +108,7 @@ def stored(x: jax.Array) -> jax.Array:
 def step_shapes(env: Environment, actor: PyTree) -> tuple[Any, ...]:
     """Returns the shapes of the arguments of a step."""
     shape = jax.ShapeDtypeStruct
-    state = jax.eval_shape(
-        lambda: [stored(x) for x in jax.tree.leaves(env.reset(jax.random.key(0)))]
-    )
+    state = base.shapes(lambda: [stored(x) for x in jax.tree.leaves(env.reset(jax.random.key(0)))])
     flag = shape((), jnp.int32)
     actor = jax.tree.map(lambda x: shape(x.shape, x.dtype), actor)
     return actor, Carried(state, shape((2, 2), jnp.uint32)), flag, flag, flag
@@ -238,26 +235,20 @@ def _by_teams(
     if team.why_not(env) is not None:
         return None
 
-    def of_teams(*args: Any) -> Any:  # another function for JAX, which keeps what it has traced
-        return function(*args)
-
-    with base.keeping_whole() as kept:
-        traced, shapes = jaxprs.trace(of_teams, *examples)
-        if any("jit" in x.primitive.name and "whole[" in str(x) for x in traced.jaxpr.eqns):
-            jax.clear_caches()  # a method that is jitted keeps what was traced
-            return None
-        if {id(owner) for _, owner in kept if owner is not None} != {id(team.innermost(env))}:
-            return None
-        physics = team.physics_of(env)
-        source = f"{jaxprs.fingerprint(traced)} {physics} {objects.source_digest(*_WRITERS)}"
-
-        def write() -> str:
-            return writers.team(_written(of_teams, examples, LOOPS), physics)
-
-        capability = gpu_seam.compute_capability()
+    with base.keeping_whole():
         try:
+            traced, shapes = jaxprs.trace(function, *examples)
+            if [*map(id, scalar.owners(traced))] != [id(team.innermost(env))]:
+                return None
+            physics = team.physics_of(env)
+            source = f"{jaxprs.fingerprint(traced)} {physics} {objects.source_digest(*_WRITERS)}"
+
+            def write() -> str:
+                return writers.team(_written(function, examples, LOOPS), physics)
+
+            capability = gpu_seam.compute_capability()
             return ptx.load_kernel(f"{use} {source}", write, capability, objects.folder()), shapes
-        except (scalar.UnsupportedPrimitive, scalar.TooLarge) as error:
+        except (scalar.UnsupportedPrimitive, scalar.TooLarge, NotImplementedError) as error:
             warnings.warn(f"a thread plays an episode, slower than lanes: {error}", stacklevel=2)
             return None
 
@@ -292,7 +283,7 @@ def machine_map(
         whole = [x != 0 if leaf.dtype == bool else x for x, leaf in zip(values, given, strict=True)]
         return [stored(x) for x in jax.tree.leaves(function(*tree.unflatten(whole)))]
 
-    out = jax.eval_shape(function, *examples)
+    out = base.shapes(function, *examples)
     results, out_tree = jax.tree.flatten(out)
     kept = [jax.eval_shape(stored, x) for x in given]
     for leaf in (*kept, *map(jax.eval_shape, [stored] * len(results), results)):

@@ -42,6 +42,7 @@ from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive as Unsupport
 from mjx_reinforce.engine.scalar.jaxprs import prune as prune
 from mjx_reinforce.engine.scalar.primitives import any_lane as any_lane
 from mjx_reinforce.engine.scalar.primitives import by_engine as by_engine
+from mjx_reinforce.engine.scalar.primitives import owners as owners
 from mjx_reinforce.engine.scalar.primitives import skippable as skippable
 from mjx_reinforce.engine.scalar.primitives import whole as whole
 from mjx_reinforce.engine.scalar.scalarized import Scalarized as Scalarized

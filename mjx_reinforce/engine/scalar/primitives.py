@@ -11,6 +11,7 @@ lane does not need it.
 """
 
 import functools
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -21,7 +22,7 @@ import numpy as np
 from jax.extend import core
 from jax.interpreters import ad, batching, mlir
 
-from mjx_reinforce.engine.base import PyTree, note_whole
+from mjx_reinforce.engine.base import PyTree
 from mjx_reinforce.engine.scalar import jaxprs
 
 #: Its operands are those of both programs, which read what they need of them.
@@ -201,9 +202,19 @@ def whole(
       *args: its operands.
       owner: whose operation it is, if it is not everybody's.
     """
-    note_whole(name, owner)
     facts = tuple((field, x.shape, np.dtype(x.dtype)) for field, x in results.items())
-    return dict(zip(results, _WHOLE.bind(*args, name=name, results=facts), strict=True))
+    made = _WHOLE.bind(*args, name=name, results=facts, owner=owner)
+    return dict(zip(results, made, strict=True))
+
+
+def owners(traced: jaxprs.Program) -> list[Any]:
+    """Returns, each once, whose operations a program calls by their names."""
+    found: list[Any] = []
+    for eqn in traced.jaxpr.eqns:
+        inner = map(owners, jaxprs.subprograms(eqn.params.values()))
+        of = [eqn.params["owner"]] if eqn.primitive is _WHOLE else itertools.chain(*inner)
+        found += [x for x in of if x is not None and all(x is not y for y in found)]
+    return found
 
 
 @jax.custom_batching.custom_vmap

@@ -23,6 +23,7 @@ from mjx_reinforce.engine.base import (
     PyTree,
     action_space,
     null_action,
+    shapes,
 )
 from mjx_reinforce.engine.checks import check_count, check_key, check_name, check_type
 from mjx_reinforce.engine.contract import check_environment, check_shape
@@ -85,7 +86,7 @@ class VectorState(Arrays):
 
 def blank(env: Environment) -> VectorState:
     """Returns the shapes of one environment's entry of a ``VectorState``."""
-    return jax.eval_shape(functools.partial(_begin, env), jax.ShapeDtypeStruct((2,), jnp.uint32))
+    return shapes(functools.partial(_begin, env), jax.ShapeDtypeStruct((2,), jnp.uint32))
 
 
 def advance_function(env: Environment, limit: int | None, autoreset: str) -> Callable[..., Any]:
