@@ -53,7 +53,7 @@ def compile_driver(
         first = slots.states()
         if found is not None:
             slots.restore(found.state[0])
-        env_steps = env_steps_in(60 * config.minutes, slots, config.max_updates)
+        env_steps = env_steps_in(60 * config.minutes, slots, config)
         slots.restore(first)
         say(f"{config.minutes:g} min are about {env_steps:,} env steps of a seed in all here")
         config = dataclasses.replace(config, env_steps=env_steps, minutes=None)
@@ -135,7 +135,7 @@ def train_run(
 _PART = 0.03
 
 
-def env_steps_in(seconds: float, slots: Slots, max_updates: int | None) -> int:
+def env_steps_in(seconds: float, slots: Slots, config: Config) -> int:
     """Returns the env steps that a mean seed will have played in all after a time.
 
     The seeds are trained, and evaluated, for a small part of that time. The speed of the second
@@ -145,23 +145,31 @@ def env_steps_in(seconds: float, slots: Slots, max_updates: int | None) -> int:
     Args:
       seconds: the time.
       slots: the seeds, where the run goes on.
-      max_updates: of the run, if any.
+      config: the settings.
     """
-    slots.budget = Budget.of(None, max_updates)
-    began, past = time.perf_counter(), [(0.0, _played(slots))]
-    going = True
-    while going and past[-1][0] < _PART * seconds:
-        going = bool(slots.advance())
-        past.append((time.perf_counter() - began, _played(slots)))
-    end, played = past[-1]
-    half, before = next((x for x in past[1:-1] if x[0] >= end / 2), past[-2])
-    speed = (played - before) / (end - half)
-    return min(max(1, round(past[0][1] + speed * max(seconds - end, 0.0))), MAX_COUNT)
+    most = MAX_COUNT if config.max_updates is None else config.max_updates
+    began, past = time.perf_counter(), [(0.0, *_played(slots))]
+    while past[-1][0] < _PART * seconds:
+        slots.budget = Budget.of(None, min(past[-1][2] + 2 ** (len(past) - 1), most))
+        if not slots.advance(look=False):
+            break  # no seed has an update left
+        past.append((time.perf_counter() - began, *_played(slots)))
+    if len(past) == 1:
+        return max(1, round(past[0][1]))
+    end, played, updates = past[-1]
+    half, before, made = next((x for x in past[1:-1] if x[0] >= end / 2), past[-2])
+    a_block = config.block_length * (end - half) / (updates - made)
+    evaluating = slots.seconds_to_evaluate()
+    speed = (played - before) / (end - half) * a_block / (a_block + evaluating)
+    left = max(seconds - end - evaluating, 0.0)
+    return min(max(1, round(past[0][1] + speed * left)), MAX_COUNT)
 
 
-def _played(slots: Slots) -> float:
-    """Returns the env steps of the mean seed."""
-    return float(counts.to_int(slots.states().train_states.env_steps).mean())
+def _played(slots: Slots) -> tuple[float, int]:
+    """Returns the env steps of the mean seed, and the updates of the seed with the most."""
+    states = slots.states().train_states
+    updates = counts.to_int(states.num_updates)
+    return float(counts.to_int(states.env_steps).mean()), int(updates.max())
 
 
 class RunResults(NamedTuple):

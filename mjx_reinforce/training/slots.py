@@ -23,7 +23,7 @@ import numpy as np
 from jax import lax
 
 from mjx_reinforce.engine.base import PyTree, plain, with_keys
-from mjx_reinforce.engine.devices import NONE, RUNS, SECOND
+from mjx_reinforce.engine.devices import NONE, RUNS, SECOND, executable
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.policy import Actor
@@ -275,6 +275,11 @@ class Slots:
         every = [_of_slots(lanes, slots) for slots in zip(*blocks, strict=True)]
         return [measured for measured in every if measured.metrics["active"].any()]
 
+    def seconds_to_evaluate(self) -> float:
+        """Returns how long an evaluation takes (s) that does not ride with the updates."""
+        began = time.perf_counter()
+        return 0.0 if self._rides or not self.evaluate() else time.perf_counter() - began
+
     def evaluate(self) -> Measured:
         """Evaluates the present policies of all runs."""
         lanes, programs = self._pack()
@@ -402,7 +407,7 @@ def _compile_begin(programs: Programs, layout: StateRows, width: int) -> Callabl
     numbers = jax.ShapeDtypeStruct((width,), np.uint32)
     given = division.shapes((numbers, shape_of_all(programs.like, width).settings), RUNS)
     program = division.jit(begin, (NONE, RUNS, RUNS), (RUNS, SECOND))
-    return program.lower(seed, *given).compile()
+    return executable(program.lower(seed, *given))
 
 
 def _trace_slot(programs: Programs, layout: StateRows, width: int) -> Callable[[], Slot]:
@@ -428,8 +433,9 @@ def _trace_slot(programs: Programs, layout: StateRows, width: int) -> Callable[[
     given = rows, nothing, which, no_look
     specs = (RUNS, NONE, RUNS, NONE), (RUNS, SECOND, RUNS)
     looking = division.jit(evaluate, (RUNS, RUNS), RUNS).lower(rows, which)
-    evaluating = started(looking.compile)
-    advancing = started(division.jit(advance, *specs, by_episodes=True).lower(*given).compile)
+    evaluating = started(functools.partial(executable, looking))
+    updating = division.jit(advance, *specs, by_episodes=True).lower(*given)
+    advancing = started(functools.partial(executable, updating))
 
     def wait() -> Slot:
         slot = Slot(advancing.result(), evaluating.result())

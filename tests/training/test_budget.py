@@ -129,40 +129,45 @@ def test_the_tables_are_good_to_a_factor_of_three(monkeypatch, env, num_seeds, s
 
 
 class Machine:
-    """Slots whose runs play so many env steps in each block."""
+    """Slots whose runs play so many env steps in each update, which takes a second."""
 
-    def __init__(self, played, blocks=10**6):
-        self.played, self.left, self.env_steps = iter(played), blocks, 0
+    def __init__(self, played, evaluating=0.0):
+        self.played, self.evaluating, self.now = iter(played), evaluating, 0.0
+        self.env_steps, self.updates, self.budget = 0, 0, None
 
     def states(self):
-        each = np.stack([np.asarray(counts.from_int(self.env_steps))] * 2)
-        return SimpleNamespace(train_states=SimpleNamespace(env_steps=each))
+        def both(x):
+            return np.stack([np.asarray(counts.from_int(x))] * 2)
 
-    def advance(self):
-        self.env_steps += next(self.played)
-        self.left -= 1
-        return [None] * (self.left > 0)
+        states = SimpleNamespace(env_steps=both(self.env_steps), num_updates=both(self.updates))
+        return SimpleNamespace(train_states=states)
 
+    def advance(self, look):
+        assert not look
+        made = int(counts.to_int(np.asarray(self.budget.updates))) - self.updates
+        self.env_steps += sum(itertools.islice(self.played, made))
+        self.updates, self.now = self.updates + made, self.now + made
+        return [None] * made
 
-@pytest.fixture
-def clock(monkeypatch):
-    """The clock goes a second a question."""
-    seconds = itertools.count()
-    monkeypatch.setattr(from_python.time, "perf_counter", lambda: float(next(seconds)))
+    def seconds_to_evaluate(self):
+        return self.evaluating
 
 
 @pytest.mark.parametrize(
-    ("seconds", "played", "blocks", "expected"),
+    ("seconds", "machine", "config", "expected"),
     [
-        # Ten blocks are 3 % of the time; the steps of the trial are trained again.
-        (300.0, itertools.repeat(50), 10**6, 50 * (300 - 10 + 1)),
-        (300.0, [*[1000] * 4, *[10] * 9], 10**6, 10 * 291),  # its second half counts
-        (1e6, itertools.repeat(7), 3, 7 * (10**6 - 3)),  # the run ends by itself
-        (1e12, itertools.repeat(10**9), 4, MAX_COUNT),
+        # The steps of the trial of 1, 2, 4 and 8 updates are trained again.
+        (300.0, Machine(itertools.repeat(50)), Config(), 50 * (300 - 15)),
+        (300.0, Machine([*[1000] * 7, *[10] * 8]), Config(), 10 * 285),  # its second half counts
+        # Blocks of 10 updates wait 10 s for an evaluation: the speed is half.
+        (310.0, Machine(itertools.repeat(50), 10.0), Config(eval_every=10), 25 * (310 - 15 - 10)),
+        (1e6, Machine(itertools.repeat(7)), Config(max_updates=3), 7 * (10**6 - 3)),  # it ends
+        (1e12, Machine(itertools.repeat(10**9)), Config(max_updates=4), MAX_COUNT),
     ],
 )
-def test_what_is_trained_in_a_time(clock, seconds, played, blocks, expected):
-    assert from_python.env_steps_in(seconds, Machine(played, blocks), None) == expected
+def test_what_is_trained_in_a_time(monkeypatch, seconds, machine, config, expected):
+    monkeypatch.setattr(from_python.time, "perf_counter", lambda: machine.now)
+    assert from_python.env_steps_in(seconds, machine, config) == expected
 
 
 # How much of a budget is used, and when a checkpoint is due.
