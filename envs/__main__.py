@@ -6,7 +6,7 @@ import sys
 import tyro
 
 from mjx_reinforce import envs
-from mjx_reinforce.console.streams import for_stream
+from mjx_reinforce.console.streams import say
 from mjx_reinforce.settings.flags import run_command
 
 
@@ -33,7 +33,7 @@ def _print(settings: EnvsSettings) -> None:
     from mjx_reinforce.runs.about_task import about_task
 
     configure_jax()
-    print(for_stream(about_task(settings.env), sys.stdout))
+    say(about_task(settings.env), sys.stdout)
 
 
 if __name__ == "__main__":

@@ -30,13 +30,13 @@ def _command(arguments: list[str]) -> tuple[str, list[str]]:
     first = arguments[0] if arguments else "--help"
     if first in COMMANDS:
         return first, arguments[1:]
-    from mjx_reinforce.console.streams import accept_everything, for_stream, say_error
+    from mjx_reinforce.console.streams import accept_everything, say, say_error
     from mjx_reinforce.store.provenance import version
 
     accept_everything()
     ours = version("mjx-reinforce") or "not installed"
     if first in ("-h", "--help", "help"):
-        print(for_stream(menu(ours), sys.stdout))
+        say(menu(ours), sys.stdout)
         sys.exit(0)
     if first in ("-V", "--version", "version"):
         print(SCRIPT, ours)

@@ -3,9 +3,7 @@
 import contextlib
 import io
 import os
-import re
 import sys
-import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -57,52 +55,17 @@ def silence_alarms() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 
-#: Columns where nobody knows how many there are.
-_DEFAULT_WIDTH = 80
-#: A terminal with fewer wraps by itself.
-_LEAST_COLUMNS = 20
+def say(text: str, stream: TextIO) -> None:
+    """Prints text: on a terminal its lines end between words, else they are whole, for grep."""
+    from rich.console import Console
 
-
-def wrapped(text: str, columns: int) -> str:
-    """Returns text whose lines have at most so many columns, and whole words.
-
-    An indented line is an entry of a list: where two spaces or more divide it, its second part
-    stays a column.
-    """
-    return "\n".join(_wrapped_line(line, columns) for line in text.split("\n"))
-
-
-def _wrapped_line(line: str, columns: int) -> str:
-    entry = re.match(r" +(\S+(?: \S+)*  +)?", line)
-    later = 0 if entry is None else len(entry[0]) + (0 if entry[1] else 2)
-    return textwrap.fill(
-        line,
-        columns,
-        subsequent_indent=" " * later,
-        break_long_words=False,
-        break_on_hyphens=False,
-        replace_whitespace=False,
-    )
-
-
-def for_stream(text: str, stream: TextIO) -> str:
-    """Returns text as a stream shows it: wrapped on a terminal, else as it is, to be searched."""
-    return wrapped(text, columns_of(stream)) if stream.isatty() else text
-
-
-def columns_of(stream: TextIO) -> int:
-    """Returns how wide a stream is: what COLUMNS says, or its terminal, or else 80."""
-    given = os.environ.get("COLUMNS", "")
-    columns = int(given) if given.isdecimal() else 0
-    if not columns and stream.isatty():
-        columns = os.get_terminal_size(stream.fileno()).columns
-    return max(columns or _DEFAULT_WIDTH, _LEAST_COLUMNS)
+    console = Console(file=stream, emoji=False, markup=False, highlight=False)
+    console.print(text, soft_wrap=not console.is_terminal)
 
 
 def say_error(message: str) -> None:
-    """Prints what is wrong to standard error: one line, wrapped on a terminal."""
-    text = f"error: {' '.join(message.split())}"
-    print(for_stream(text, sys.stderr), file=sys.stderr)
+    """Prints what is wrong to standard error, in one line."""
+    say(f"error: {' '.join(message.split())}", sys.stderr)
 
 
 #: Seconds between two signs.

@@ -138,8 +138,6 @@ def test_a_policy_of_the_package_can_be_exported(tmp_path, monkeypatch):
         (["--output", "nowhere/policy.npz"], "cannot write to nowhere"),
         (["--output", "mine.py/policy.npz"], "cannot write to mine.py"),
         (["--output", "/proc/policy.npz"], "cannot write to /proc; choose another"),
-        (["--sede", "1"], "unknown flag '--sede'. Did you mean '--seed'?"),
-        (["--seed", "middle"], "middle"),
         (["--output", "mine.npz"], "mine.py exists; pass --overwrite"),
         (["--output", "folder.npz", "--overwrite"], "folder.npz exists"),
         (["--seed", "9"], "has no seed 9: its seeds are 0 to 2"),

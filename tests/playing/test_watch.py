@@ -136,8 +136,6 @@ def test_the_compilation_cache_is_that_of_training(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--sed", 3], "error: unknown flag '--sed'. Did you mean '--seed'?"),
-        (["--width", "wide"], "--width takes a whole number, such as 4 or 2e6, got 'wide'"),
         (["--seed", 3], "has no seed 3: its seeds are 0 to 2"),
         (["--which", "best"], "has no policy/best"),
         (["--seconds", 0], "--seconds must be positive and finite, got 0"),

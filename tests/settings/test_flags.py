@@ -1,4 +1,4 @@
-"""Reading a command line into dataclasses, and refusing in one line of our words."""
+"""Reading a command line into dataclasses."""
 
 import dataclasses
 import sys
@@ -50,31 +50,17 @@ def test_values_of_all_types():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--number", "2.5"], "--number takes a whole number"),
-        (["--number", "many"], "--number takes a whole number"),
-        (["--number"], "Missing value for argument '--number'"),
-        (["--rate", "fast"], "--rate takes a number, such as 0.5, got 'fast'"),
-        (["--place", ""], "--place takes PATH, got ''"),
-        (
-            ["--kind", "oval"],
-            "invalid choice 'oval' for argument '--kind'",
-        ),
-        (["--sizes", "8", "x"], "x"),
-        (["--nubmer", "3"], "unknown flag '--nubmer'. Did you mean '--number'?"),
-        (["--", "--number", "3"], "--number stands after --, which ends the flags: leave -- out"),
-        (["--zzz"], "unknown flag '--zzz'. (See --help.)"),
-        (["--quick", "true"], "no flag or command takes 'true'. (See --help.)"),
-        (["--number", "3", "Hopper-v5"], "'Hopper-v5' is a task: write "),
-        (["own:Crane"], "train --env own:Crane"),
-        (["Hoper-v5"], "Did you mean 'Hopper-v5'?"),
-        (["watch"], "'watch' is a command of its own, "),
-        (["gymnasium-tutorial"], "a preset comes before all flags"),
+        ("--number 2.5", "takes a whole number, such as 4 or 2e6, got '2.5'"),
+        ("--rate fast", "takes a number, such as 0.5, got 'fast'"),
+        ("--place=", "takes a path, got ''"),
+        ("--nubmer 3", "--number"),
+        ("--quick true", "true"),
     ],
 )
-def test_what_cannot_be_read_is_one_line(words, message):
-    with pytest.raises(ValueError, match=r"^[^\n│]*$") as refused:
-        read(*words)
-    assert message in str(refused.value)
+def test_what_cannot_be_read_is_said_by_tyro_and_in_our_words(words, message, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        read(*words.split())
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -94,7 +80,7 @@ def test_the_brief_help_shows_the_main_settings_and_how_to_see_all(capsys, monke
     assert "--number INT" in page
     assert "How many there are, in one paragraph." in page
     assert "--rate" not in page
-    assert "--help all shows all 6 settings." in page
+    assert "--help all shows all settings." in page
 
 
 def test_the_whole_help_shows_every_setting(capsys):
