@@ -1,10 +1,9 @@
 """``python -m mjx_reinforce.report RUN_OR_SWEEP`` makes a page of what runs and sweeps found."""
 
 import dataclasses
-import math
 import shlex
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,9 +20,6 @@ from mjx_reinforce.reports.findings import Findings, compute_findings, swept, wo
 from mjx_reinforce.settings.config import env_flag
 from mjx_reinforce.settings.flags import run_command
 from mjx_reinforce.store.provenance import version
-
-#: With these a spreadsheet's formula begins. page.js has them, too.
-_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,30 +151,12 @@ def results_csv(findings: Findings) -> str:
             solved = int(solving.steps[s]) if solving and solving.solved[s] else ""
             values = (seed, final[s], best[s], solved, end[s], int(part.nonfinite[s]))
             lines.append((place + 1, *settings, *values))
-    return csv_text(map(_no_formulas, lines))
+    return csv_text(lines)
 
 
 def table_csv(table: Table, labels: Sequence[str]) -> str:
     """Returns a table as a CSV file."""
-    listed = rows(table, labels)
-    return csv_text(map(_no_formulas, [table, *(row.values() for row in listed)]))
-
-
-def _no_formulas(cells: Iterable[Any]) -> list[Any]:
-    return [*map(_no_formula, cells)]
-
-
-def _no_formula(cell: object) -> Any:
-    """Returns a cell with an apostrophe before a name that a spreadsheet would compute.
-
-    Run directories may be called "=HYPERLINK(1)". Numbers stay, also those that are texts.
-    """
-    if not isinstance(cell, str) or not cell.startswith(_FORMULA):
-        return cell
-    try:
-        return cell if math.isfinite(float(cell)) else f"'{cell}"
-    except ValueError:
-        return f"'{cell}"
+    return csv_text([table, *(row.values() for row in rows(table, labels))])
 
 
 def how_to_watch(experiment: Experiment, findings: Findings) -> Watch:

@@ -12,10 +12,10 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from scipy import stats
 
+from experiments.studies.seeds import answers
 from mjx_reinforce.statistics import aggregates, comparisons, survival
 
 SEEDS = (6, 20, 50, 200)
-Ends = tuple[np.ndarray, np.ndarray]
 
 
 def solved_or_not(u: np.ndarray) -> np.ndarray:
@@ -36,13 +36,11 @@ DISTRIBUTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "two peaks": two_peaks,
     "heavy tail (Student's t, 3)": stats.t(3).ppf,
 }
-STATISTICS = ("mean", "median", "iqm", "cvar")
+STATISTICS = ("mean", "iqm", "cvar")
 
 
 def truth(quantile: Callable[[np.ndarray], np.ndarray], statistic: str) -> float:
     """Returns a statistic of the distribution itself, from a million of its quantiles."""
-    if statistic == "median":
-        return float(quantile(np.array(0.5)))
     values = quantile((np.arange(10**6) + 0.5) / 10**6)
     low, high = {"mean": (0, 1), "iqm": (0.25, 0.75), "cvar": (0, 0.1)}[statistic]
     return float(np.mean(values[int(low * 10**6) : int(high * 10**6)]))
@@ -56,28 +54,8 @@ def one_sample(draws: int) -> Iterator[tuple[str, str, list[str]]]:
             cells = []
             for num_seeds in SEEDS:
                 values = quantile(np.random.default_rng(num_seeds).random((draws, num_seeds)))
-                found = aggregates.interval(statistic, values)
-                cells.append(share(found.low, found.high, true))
+                cells.append(share(*aggregates.interval(statistic, values)[1:], true))
             yield statistic, name, cells
-
-
-def stratified(draws: int) -> Iterator[tuple[str, str, list[str]]]:
-    """Yields the same for the IQM and the mean over five tasks, 1 apart from each other."""
-    shift = np.arange(5.0)
-    grid = stats.norm.ppf((np.arange(10**6) + 0.5) / 10**6)
-    middle = np.sort(np.add.outer(shift, grid[::5]).ravel())
-    for statistic, true in (("iqm", float(stats.trim_mean(middle, 0.25))), ("mean", 2.0)):
-        cells = []
-        for num_seeds in SEEDS:
-            tasks = np.arange(num_seeds) % 5
-            if num_seeds < 10:
-                cells.append("")
-                continue
-            random = np.random.default_rng(num_seeds)
-            values = random.normal(size=(draws, num_seeds)) + shift[tasks]
-            found = aggregates.interval(statistic, values, strata=tasks)
-            cells.append(share(found.low, found.high, true))
-        yield f"{statistic}, five tasks ({draws:,} draws)", "normal", cells
 
 
 def rates(draws: int) -> Iterator[tuple[str, str, list[str]]]:
@@ -86,8 +64,7 @@ def rates(draws: int) -> Iterator[tuple[str, str, list[str]]]:
         cells = []
         for num_seeds in SEEDS:
             count = np.random.default_rng(num_seeds).binomial(num_seeds, rate, draws)
-            _, low, high = aggregates.wilson(count, num_seeds)
-            cells.append(share(low, high, rate))
+            cells.append(share(*aggregates.wilson(count, num_seeds)[1:], rate))
         yield "rate (Wilson)", f"{100 * rate:.0f} %", cells
 
 
@@ -131,8 +108,7 @@ def two_samples(draws: int) -> Iterator[tuple[str, str, list[str]]]:
                 ("the same, paired", same),
                 ("paired difference (t)", comparisons.paired_difference),
             ):
-                found = function(x, y)
-                cells[kind].append(share(found.low, found.high, float(true[kind])))
+                cells[kind].append(share(*function(x, y)[1:3], float(true[kind])))
         for kind, row in cells.items():
             yield kind, name, row
 
@@ -147,8 +123,8 @@ def paired_rates(draws: int) -> Iterator[tuple[str, str, list[str]]]:
             luck = random.random((2, draws, num_seeds))
             shared = random.random((draws, num_seeds)) < alike
             luck[1] = np.where(shared, luck[0], luck[1])
-            found = comparisons.paired_rates(luck[0] < first, luck[1] < second)
-            cells.append(share(found.low, found.high, first - second))
+            found = answers.paired_rates(luck[0] < first, luck[1] < second)
+            cells.append(share(*found[1:3], first - second))
         yield "difference of paired rates (Newcombe)", name, cells
 
 
@@ -199,8 +175,7 @@ def main() -> None:
     print(f"Share of {draws:,} draws whose 95 % interval covers the truth, in percent\n")
     print("| interval | distribution |", *(f"{n} seeds |" for n in SEEDS))
     print("|---|---|" + "---|" * len(SEEDS))
-    parts = one_sample(draws), rates(draws), two_samples(draws), paired_rates(draws), times(draws)
-    for part in (*parts, stratified(max(draws // 20, 10))):
+    for part in (f(draws) for f in (one_sample, rates, two_samples, paired_rates, times)):
         for interval, distribution, cells in part:
             print(f"| {interval} | {distribution} |", *(f"{c} |" for c in cells), flush=True)
 

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy import stats
 
 from mjx_reinforce.reports.experiment import relabel
 from mjx_reinforce.reports.findings import Findings, compute_findings
 from mjx_reinforce.reports.sources import read_experiment
-from mjx_reinforce.statistics.aggregates import interval
-from mjx_reinforce.statistics.survival import combined, log_rank
+from mjx_reinforce.statistics.survival import log_rank
 
 
 def read(directories: list[Path]) -> list[Findings]:
@@ -41,6 +41,13 @@ def scores(found: Findings, name: str) -> np.ndarray:
     return (found.results[found.labels.index(name)].scores - zero) / (one - zero)
 
 
+#: Statistics of the tasks' scores: the mean of their means, and the IQM of all of them.
+STATISTICS = (
+    lambda *x, axis=-1: np.mean([each.mean(axis) for each in x], axis=0),
+    lambda *x, axis=-1: stats.trim_mean(np.concatenate(x, axis=axis), 0.25, axis=axis),
+)
+
+
 def compare(tasks: list[Findings], picture: str) -> None:
     """Prints the table and draws the figure of the configurations that all tasks have."""
     own = {
@@ -53,8 +60,11 @@ def compare(tasks: list[Findings], picture: str) -> None:
     panels = figure.subplots(1, len(tasks), squeeze=False)[0]
     print("| configuration | seeds | mean score | interquartile mean | p |\n|---|---|---|---|---|")
     for name in order:
-        strata = np.repeat(range(len(tasks)), [len(each) for each in own[name]])
-        mean, iqm = (interval(x, np.concatenate(own[name]), strata=strata) for x in ("mean", "iqm"))
+        said = []
+        for statistic in STATISTICS:  # as in rliable, of which each task's seeds are drawn apart
+            found = stats.bootstrap(own[name], statistic, method="percentile", rng=0)
+            low, high = found.confidence_interval
+            said.append(f"{statistic(*own[name]):.3f} ({low:.3f} to {high:.3f})")
         tests = []
         for panel, each in zip(panels, tasks, strict=True):
             best, result = (each.results[each.labels.index(x)] for x in (order[0], name))
@@ -64,9 +74,8 @@ def compare(tasks: list[Findings], picture: str) -> None:
             if best.solving and result.solving:
                 pair = [x for e in (best.solving, result.solving) for x in (e.steps, e.solved)]
                 tests.append(log_rank(*pair).statistic)
-        said = [f"{x.value:.3f} ({x.low:.3f} to {x.high:.3f})" for x in (mean, iqm)]
-        p = f"{combined(tests):.2g}" if tests else "none"
-        print(f"| {name} | {len(strata)} | {said[0]} | {said[1]} | {p} |")
+        p = f"{2 * stats.norm.sf(abs(sum(tests)) / len(tests) ** 0.5):.2g}" if tests else "none"
+        print(f"| {name} | {sum(map(len, own[name]))} | {said[0]} | {said[1]} | {p} |")
     panels[0].legend()
     figure.savefig(picture)
 

@@ -14,8 +14,7 @@ from mjx_reinforce.reports import charts, words
 from mjx_reinforce.reports.charts import curves, distribution, final, profile, sensitivity, solved
 from mjx_reinforce.reports.experiment import Experiment, counted, say, setting_in_words
 from mjx_reinforce.reports.findings import COMPARED, Findings
-from mjx_reinforce.reports.listings import Listing, key_figures, listings
-from mjx_reinforce.reports.listings import matrix as pairs_matrix
+from mjx_reinforce.reports.listings import key_figures, listings
 from mjx_reinforce.reports.words import steps
 
 #: The charts in the order of the page.
@@ -131,7 +130,7 @@ def _text(findings: Findings, drawn: list[charts.Chart]) -> dict[str, Any]:
     """Returns the text of the page, without the provenance of its numbers."""
     figures = {figure.name: figure for figure in drawn}
     sensitivity = [figure for figure in drawn if figure.name.startswith("sensitivity-")]
-    listed, matrix = listings(findings), pairs_matrix(findings)
+    listed = listings(findings)
     names = ("final", "curves", "solved", "distribution", "profile")
     failures = any(not math.isfinite(x) for each in findings.results for x in each.final)
     return {
@@ -140,20 +139,13 @@ def _text(findings: Findings, drawn: list[charts.Chart]) -> dict[str, Any]:
         "distrust": list(words.caveats(findings)),
         "figures": {name: figures.get(name) for name in names},
         "failures": failures,
-        "matrix": matrix,
         "pairs": counted(len(findings.comparisons), "pair"),
         "listed": listed,
         "until": steps(findings.learning.until),
-        "numbers": _table_numbers(listed),
+        "numbers": {name: place for place, name in enumerate(listed, start=1)},
         "sensitivity": sensitivity,
         "compared": COMPARED,
     }
-
-
-def _table_numbers(listed: Mapping[str, Listing]) -> dict[str, int]:
-    """Returns the number on the page of each table; who beats whom stands before "against"."""
-    names = [x for name in listed for x in (["matrix"] if name == "against" else []) + [name]]
-    return {name: place for place, name in enumerate(names, start=1)}
 
 
 #: What the name of an entry of the provenance would not tell.

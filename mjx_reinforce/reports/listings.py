@@ -1,6 +1,5 @@
 """The report's tables, as the page shows them."""
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -107,29 +106,6 @@ def _p_against(tests: Sequence[SpeedTest | Comparison], i: int, best: int, said:
     return said if i == best else short_p(found[0]) if found else "none"
 
 
-def matrix(findings: Findings) -> list[dict[str, Any]]:
-    """Returns who beats whom: a row and a cell for each configuration, None on the diagonal."""
-    if not findings.comparisons:
-        return []
-    labels = findings.labels[:COMPARED]
-    cells: list[list[Any]] = [[None] * len(labels) for _ in labels]
-    for pair in findings.comparisons:
-        sure = pair.adjusted < words.LEVEL
-        for i, j, share in (
-            (pair.first, pair.second, float(pair.improvement.value)),
-            (pair.second, pair.first, 1 - float(pair.improvement.value)),
-        ):
-            cells[i][j] = {
-                "text": f"{100 * share:.0f}",
-                "sure": sure,
-                "tint": 0 if share >= 0.5 else 1,
-                "strength": f"{min(0.45, 0.9 * abs(share - 0.5)):.2f}",
-                "title": f"{labels[i]} against {labels[j]}: {percent(share)}; "
-                f"{words.p_value(pair.adjusted)}",
-            }
-    return [{"label": label, "cells": row} for label, row in zip(labels, cells, strict=True)]
-
-
 def _against(findings: Findings) -> Listing:
     """Returns the comparisons of the best configuration with each other one."""
     rows = []
@@ -142,35 +118,19 @@ def _against(findings: Findings) -> Listing:
 
 
 def _worst(findings: Findings) -> Listing:
-    """Returns the fates of the best configuration's worst seeds and of the others' worst one."""
+    """Returns the best configuration's worst seeds and the others' worst one."""
     best, *others = findings.results
     seeds = [(best, s) for s in worst_seeds(best)]
     seeds += [(each, worst_seeds(each)[0]) for each in others[: COMPARED - 1]]
+    header = ["configuration", "seed", "return at the end", "best return"]
+    if findings.experiment.threshold is not None:
+        header.append("first solved at")
     rows = []
     for each, s in seeds:
-        final = float(each.final[s])
-        said = number(final) if math.isfinite(final) else "not finite"
-        ended = str(int(each.configuration.seed[s])), said, _how_it_ended(findings, each, s)
-        rows.append(_row(each, [(cell, "") for cell in ended]))
-    return {"header": ["configuration", "seed", "return at the end", "what happened"], "rows": rows}
-
-
-def _how_it_ended(findings: Findings, result: Result, s: int) -> str:
-    """Returns how a seed ended, and how it came to that."""
-    part, threshold = result.configuration, findings.experiment.threshold
-    returns, at = part.eval_return[:, s], part.env_steps[:, s]
-    if not np.isfinite(returns[-1]):
-        first = len(returns) - int(np.argmax(np.isfinite(returns[::-1])))
-        since = at[first % len(returns)] if np.isfinite(returns).any() else 0
-        return f"not finite since {steps(float(since))} env steps"
-    top = int(np.nanargmax(returns))
-    best = f"its best, {number(returns[top])}, was at {steps(float(at[top]))} env steps"
-    if threshold is None:
-        return "at its best at the end" if returns[-1] == returns[top] else best
-    if returns[-1] >= threshold:
-        return f"solved, first at {steps(float(result.solving.steps[s]))}" if result.solving else ""
-    if returns[top] < threshold:
-        return f"never solved; {best}"
-    lost = int(np.flatnonzero(returns >= threshold)[-1]) + 1
-    first_time = steps(float(at[np.argmax(returns >= threshold)]))
-    return f"solved at {first_time}, lost it at {steps(float(at[lost]))} env steps"
+        part, solving = each.configuration, each.solving
+        best_return = float(np.fmax.reduce(part.eval_return[:, s]))
+        cells = [str(int(part.seed[s])), number(float(each.final[s])), number(best_return)]
+        if solving:
+            cells.append(steps(float(solving.steps[s])) if solving.solved[s] else "never")
+        rows.append(_row(each, [(cell, "") for cell in cells]))
+    return {"header": header, "rows": rows}

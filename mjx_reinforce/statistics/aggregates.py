@@ -1,6 +1,4 @@
-"""One number for many seeds and how sure it is: means, the median, the lower tail, rates."""
-
-import math
+"""One number for many seeds and how sure it is: means, the lower tail, rates."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -8,9 +6,7 @@ from scipy import stats
 
 from mjx_reinforce.statistics import (
     Estimate,
-    alike,
     bootstrap,
-    enough,
     finite_or_nan,
     iqm,
     iqm_interval,
@@ -26,23 +22,18 @@ def interval(
     statistic: str,
     values: ArrayLike,
     *,
-    strata: ArrayLike | None = None,
     confidence: float = 0.95,
     fraction: float = 0.1,
 ) -> Estimate:
     """Returns a statistic over seeds with its confidence interval.
 
     The mean and the IQM have Hesterberg's expanded percentile bootstrap
-    (``bootstrap.expanded_tail``), the median has order statistics (``median_interval``), CVaR has
-    the bootstrap t (``cvar_interval``), and whatever has strata the expanded percentiles of
-    the stratified bootstrap. docs/statistics.md says how often each covers the truth.
+    (``bootstrap.expanded_tail``), CVaR has the bootstrap t (``cvar_interval``). docs/statistics.md
+    says how often each covers the truth.
 
     Args:
-      statistic: "mean", "median", "iqm" or "cvar".
+      statistic: "mean", "iqm" or "cvar".
       values: [..., S], the seeds last; not finite where a seed failed, which counts as the worst.
-      strata: [S] the task of each entry, where values of several tasks stand side by side. Seeds
-        are then resampled within each, and the mean and the median are over the tasks' means, as
-        in rliable. None: all entries are alike.
       confidence: the interval's level.
       fraction: of the seeds, that ``cvar`` is the mean of.
 
@@ -53,50 +44,15 @@ def interval(
     Raises:
       ValueError: an unknown statistic.
     """
-    known = ("mean", "median", "iqm", "cvar")
+    known = ("mean", "iqm", "cvar")
     if statistic not in known:
         raise ValueError(f"statistic: {statistic!r} is unknown; choose one of {', '.join(known)}")
     values = worst_if_not_finite(values)
-    if strata is not None:
-        return _stratified(statistic, values, np.asarray(strata), confidence, fraction)
     if statistic == "mean":
         return Estimate(finite_or_nan(np.mean(values, axis=-1)), *mean_interval(values, confidence))
-    if statistic == "median":
-        return Estimate(finite_or_nan(_median(values)), *median_interval(values, confidence))
     if statistic == "iqm":
         return Estimate(iqm(values), *iqm_interval(values, confidence=confidence))
     return Estimate(cvar(values, fraction), *cvar_interval(values, fraction, confidence))
-
-
-def median_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a confidence interval of the median from order statistics.
-
-    The k-th lowest and the k-th highest of S values enclose the median with a probability that
-    the binomial distribution gives, whatever the values' distribution; the ends are interpolated
-    between the two k whose probabilities enclose the level (Hettmansperger and Sheather 1986,
-    Statistics and Probability Letters 4). Fewer than six seeds have no interval at 95 %: from the
-    lowest to the highest covers the median of five with 93.75 %.
-
-    Args:
-      values: [..., S]; not finite where a seed failed.
-      confidence: the interval's level.
-
-    Returns:
-      Its lower and upper ends [...]; NaN for too few seeds, and for an end that is a failed seed.
-    """
-    ordered = np.sort(worst_if_not_finite(values), axis=-1)
-    num_seeds = ordered.shape[-1]
-    if not enough(num_seeds, confidence):
-        return np.full(ordered.shape[:-1], np.nan), np.full(ordered.shape[:-1], np.nan)
-    k = max(int(stats.binom.ppf((1 - confidence) / 2, num_seeds, 0.5)), 1)
-    wide, narrow = 1 - 2 * stats.binom.cdf([k - 1, k], num_seeds, 0.5)
-    excess = np.clip((wide - confidence) / (wide - narrow), 0, 1)
-    inward = (num_seeds - k) * excess / (k + (num_seeds - 2 * k) * excess)
-    mixed = []
-    for outer, inner in ((k - 1, k), (num_seeds - k, num_seeds - k - 1)):
-        with np.errstate(invalid="ignore"):
-            mixed.append((1 - inward) * ordered[..., outer] + inward * ordered[..., inner])
-    return finite_or_nan(mixed[0]), finite_or_nan(mixed[1])
 
 
 def wilson(successes: ArrayLike, trials: ArrayLike, confidence: float = 0.95) -> Estimate:
@@ -114,62 +70,6 @@ def wilson(successes: ArrayLike, trials: ArrayLike, confidence: float = 0.95) ->
     half = z * np.sqrt(rate * (1 - rate) / trials + (z / (2 * trials)) ** 2) / (1 + z**2 / trials)
     low = np.where(rate == 0, 0.0, middle - half)[()]
     return Estimate(rate, low, np.where(rate == 1, 1.0, middle + half)[()])
-
-
-def resampled(
-    statistic: str, values: np.ndarray, strata: np.ndarray, fraction: float = 0.1
-) -> np.ndarray:
-    """Returns "mean", "median", "iqm" or "cvar" of the stratified resamples, [5000].
-
-    Their 2.5 % and 97.5 % quantiles are the interval that rliable reports.
-
-    Args:
-      statistic: its name.
-      values: [S] finite or -inf.
-      strata: [S] the task of each.
-      fraction: of the seeds, that ``cvar`` is the mean of.
-    """
-    tasks = np.sort(strata)  # the entries are drawn task by task
-    return np.concatenate(
-        [
-            _of_strata(statistic, values[drawn], tasks, fraction)
-            for drawn in bootstrap.stratified_draws(strata)
-        ]
-    )
-
-
-def _stratified(
-    statistic: str, values: np.ndarray, strata: np.ndarray, confidence: float, fraction: float
-) -> Estimate:
-    """Returns the estimate of ``interval`` where there are strata."""
-    rows = values.reshape(-1, values.shape[-1])
-    sizes = np.unique(strata, return_counts=True)[1]
-    value = finite_or_nan(_of_strata(statistic, rows, strata, fraction))
-    ends = np.full((2, len(rows)), np.nan)
-    if sizes.min() > 2 and enough(len(strata) - len(sizes) + 1, confidence):
-        shrinkage = math.sqrt(1 - 1 / sizes.min())
-        tail = bootstrap.expanded_tail(confidence, len(strata) - len(sizes), shrinkage)
-        for row, some in enumerate(rows):
-            ends[:, row] = bootstrap.percentiles(resampled(statistic, some, strata, fraction), tail)
-        ends[:, alike(ends.T)] = np.nan
-    low, high = finite_or_nan(ends)
-    return Estimate(*(array.reshape(values.shape[:-1])[()] for array in (value, low, high)))
-
-
-def _of_strata(name: str, values: np.ndarray, strata: np.ndarray, fraction: float) -> np.ndarray:
-    """Returns a statistic [...] of values [..., S] of several tasks; see ``interval``."""
-    if name == "iqm":
-        return stats.trim_mean(values, 0.25, axis=-1)
-    if name == "cvar":
-        return cvar(values, fraction)
-    means = [values[..., strata == task].mean(axis=-1) for task in np.unique(strata)]
-    return (np.mean if name == "mean" else _median)(np.stack(means, axis=-1), axis=-1)
-
-
-def _median(values: np.ndarray, axis: int = -1) -> np.ndarray:
-    """Returns the median of values, finite or -inf."""
-    with np.errstate(invalid="ignore"):
-        return np.median(values, axis=axis)
 
 
 def performance_profile(

@@ -7,7 +7,6 @@ table, a product of matrices, are the means of all resamples.
 """
 
 import functools
-from collections.abc import Iterator
 
 import numpy as np
 from scipy import special
@@ -25,29 +24,14 @@ def draws(num_seeds: int) -> np.ndarray:
     The draws are those of ``scipy.stats.bootstrap(..., rng=np.random.default_rng(0))``.
     """
     counts = np.empty((num_seeds, RESAMPLES), np.uint8)
-    first = 0
-    for drawn in stratified_draws(np.zeros(num_seeds)):
+    random, at_once = np.random.default_rng(0), max(1, _DRAWS // num_seeds)
+    for first in range(0, RESAMPLES, at_once):
+        drawn = random.integers(0, num_seeds, (min(at_once, RESAMPLES - first), num_seeds))
         drawn += num_seeds * np.arange(len(drawn))[:, None]
         found = np.bincount(drawn.ravel(), minlength=drawn.size).reshape(drawn.shape)
         counts[:, first : first + len(drawn)] = found.T
-        first += len(drawn)
     counts.flags.writeable = False
     return counts
-
-
-def stratified_draws(strata: np.ndarray) -> Iterator[np.ndarray]:
-    """Yields the places of the entries drawn in resamples, [B, S], until there are 5000.
-
-    Args:
-      strata: [S] the stratum of each entry; as many are drawn from each as it has.
-    """
-    random = np.random.default_rng(0)
-    members = [np.flatnonzero(strata == stratum) for stratum in np.unique(strata)]
-    at_once = max(1, _DRAWS // len(strata))
-    for first in range(0, RESAMPLES, at_once):
-        size = min(at_once, RESAMPLES - first)
-        drawn = [places[random.integers(0, len(places), (size, len(places)))] for places in members]
-        yield np.concatenate(drawn, axis=1)
 
 
 @functools.lru_cache(maxsize=2)

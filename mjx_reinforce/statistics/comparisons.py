@@ -165,44 +165,6 @@ def least_p(first: int, second: int) -> float:
     return 2 / math.comb(first + second, first)
 
 
-def paired_rates(x: ArrayLike, y: ArrayLike, confidence: float = 0.95) -> Difference:
-    """Returns how much higher the rate of x is than that of y on the same seeds.
-
-    The interval is Newcombe's (1998, Statistics in Medicine 17, 2635-2650, method 10): Wilson's of
-    both rates, squared and added, with the correlation of the pairs. Unlike that of a t-test it has
-    width also where all seeds agree. The p value is McNemar's exact one: of the seeds that tell x
-    from y, as many would be for either.
-
-    Args:
-      x: [..., S] whether each seed of one configuration did it, such as solve the task.
-      y: [..., S] the same of another, with the same seeds in the same order.
-      confidence: the interval's level.
-
-    Raises:
-      ValueError: x and y differ in number.
-    """
-    x, y = np.asarray(x, bool), np.asarray(y, bool)
-    if x.shape != y.shape:
-        raise ValueError(f"paired values must be as many: {x.size} and {y.size} given")
-    num_seeds = x.shape[-1]
-    both, first, second, none = (np.sum(a & b, axis=-1) for a in (x, ~x) for b in (y, ~y))
-    of_x, of_y = (wilson(z.sum(axis=-1), num_seeds, confidence) for z in (x, y))
-    value = of_x.value - of_y.value
-    # The correlation, shrunk where it is positive; 0 where a rate is 0 or 1.
-    product = 1.0 * both * none - 1.0 * first * second
-    shrunk = np.where(product < 0, product, np.maximum(product - num_seeds / 2, 0))
-    spread = num_seeds**2 * np.sqrt(of_x.value * (1 - of_x.value) * of_y.value * (1 - of_y.value))
-    correlation = np.divide(shrunk, spread, out=np.zeros_like(value), where=spread > 0)
-
-    def half(one: np.ndarray, other: np.ndarray) -> Any:
-        return np.sqrt(one**2 - 2 * correlation * one * other + other**2)
-
-    low = value - half(of_x.value - of_x.low, of_y.high - of_y.value)
-    high = value + half(of_y.value - of_y.low, of_x.high - of_x.value)
-    fewer = stats.binom.cdf(np.minimum(first, second), first + second, 0.5)
-    return Difference(value, low, high, np.minimum(2 * fewer, 1.0)[()])
-
-
 def compare_all(values: Sequence[np.ndarray], confidence: float = 0.95) -> list[Comparison]:
     """Compares every pair of configurations, p values corrected after Holm.
 

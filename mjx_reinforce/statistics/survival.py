@@ -193,16 +193,6 @@ def log_rank(
     return LogRank(statistic, float(2 * stats.norm.sf(abs(statistic))))
 
 
-def combined(statistics: ArrayLike) -> float:
-    """Returns the p value, two-sided, of independent tests together (Stouffer et al. 1949).
-
-    Args:
-      statistics: [T] standard normal under the hypothesis, such as of ``log_rank`` on T tasks.
-    """
-    statistics = np.asarray(statistics, float)
-    return float(2 * stats.norm.sf(abs(statistics.sum()) / np.sqrt(len(statistics))))
-
-
 def mean_while_training(eval_return: np.ndarray, env_steps: np.ndarray, until: float) -> np.ndarray:
     """Returns each seed's mean return over its training [S]: the area under its learning curve.
 

@@ -1,12 +1,7 @@
 """Tables by columns, and what of them a spreadsheet reads."""
 
-import csv
-import io
-
 import numpy as np
-import pytest
 
-from mjx_reinforce import report
 from mjx_reinforce.reports import charts
 
 TABLE = {"configuration": [1, 0], "value": [2.5, None]}
@@ -36,20 +31,3 @@ def test_tables_stand_below_each_other():
     """What is no list is the same in all rows of its table."""
     table = charts.stacked([TABLE, {"configuration": 3, "value": [4, 5]}])
     assert table == {"configuration": [1, 0, 3, 3], "value": [2.5, None, 4, 5]}
-
-
-@pytest.mark.parametrize(
-    ("label", "cell"),
-    [
-        ("plain", "plain"),
-        ("=HYPERLINK(1)", "'=HYPERLINK(1)"),
-        ("@sum", "'@sum"),
-        ("+1+1", "'+1+1"),
-        ("-inf", "'-inf"),
-        ("-1.5", "-1.5"),
-        ("\t=1", "'\t=1"),
-    ],
-)
-def test_no_name_is_a_formula(label, cell):
-    text = report.table_csv({"configuration": [0], "value": [-2]}, [label])
-    assert list(csv.reader(io.StringIO(text))) == [["configuration", "value"], [cell, "-2"]]

@@ -51,14 +51,6 @@ def test_provenance_is_in_words():
     ]
 
 
-def test_tables_are_numbered_in_their_order():
-    """Who beats whom comes before the table of the pairs against the best."""
-    listed = dict.fromkeys(("results", "speed", "against", "worst"))
-    numbers = document._table_numbers(listed)  # pyright: ignore[reportArgumentType]
-    assert numbers == {"results": 1, "speed": 2, "matrix": 3, "against": 4, "worst": 5}
-    assert "matrix" not in document._table_numbers({"results": None})  # pyright: ignore
-
-
 @pytest.mark.parametrize(
     ("size", "words"),
     [(0, "1 kB"), (1499, "1 kB"), (1501, "2 kB"), (999_999, "1000 kB"), (1_250_001, "1.3 MB")],

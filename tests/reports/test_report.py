@@ -2,7 +2,6 @@
 
 import csv
 import json
-import math
 import re
 import sys
 from pathlib import Path
@@ -165,31 +164,6 @@ def cells(path):
     """All cells of a CSV file but the header's."""
     with path.open(encoding="utf-8", newline="") as file:
         return [cell for row in list(csv.reader(file))[1:] for cell in row]
-
-
-def is_number(text):
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False
-
-
-FORMULAS = ("=HYPERLINK(1)", "@SUM(1+1)", "+A1", "-A1", "\tA1")
-
-
-@pytest.mark.usefixtures("text_alone")
-@pytest.mark.slow
-def test_names_are_no_formulas_in_spreadsheets(tmp_path):
-    """A spreadsheet computes what begins like a formula: numbers may, names may not."""
-    runs = [make_measured_run(tmp_path / name, offset=-150.5) for name in FORMULAS]
-    report.write_report(runs, tmp_path / "page.html")
-    files = sorted((tmp_path / "page").glob("*.csv"))
-    texts = [cell for path in files for cell in cells(path)]
-    assert {"'=HYPERLINK(1)", "'@SUM(1+1)", "-120.5"} <= set(texts)
-    begun = [text for text in texts if text.startswith(("=", "+", "-", "@", "\t", "\r"))]
-    assert [text for text in begun if not is_number(text)] == []
-    text = content(tmp_path / "page.html")["results"]
-    assert (tmp_path / "page" / "results.csv").read_text(encoding="utf-8") == text
 
 
 def test_every_table_names_its_configurations(written):
@@ -418,27 +392,6 @@ def test_no_column_is_cut_at_any_width(tmp_path, over):
       return found"""
     found = in_browser(page, script, width=360)
     assert dict(zip(WIDTHS, found, strict=True)) == {width: [[], [], False] for width in WIDTHS}
-
-
-@pytest.mark.usefixtures("no_pictures")
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
-def test_tables_of_a_figure_are_no_formulas_either(tmp_path):
-    """What the page itself writes when a button is pressed."""
-    runs = [make_measured_run(tmp_path / name, offset=-150.5) for name in FORMULAS]
-    report.write_report(runs, tmp_path / "page.html")
-    script = """const saved = [], buttons = document.querySelectorAll('[data-csv]');
-      URL.createObjectURL = (blob) => { blob.text().then((text) => saved.push(text)); return '#'; };
-      buttons.forEach((x) => x.click());
-      await until(() => saved.length === buttons.length);
-      return saved"""
-    texts = in_browser(tmp_path / "page.html", script)
-    listed = [
-        cell for text in texts for row in list(csv.reader(text.splitlines()))[1:] for cell in row
-    ]
-    assert {"'=HYPERLINK(1)", "'@SUM(1+1)", "-120.5"} <= set(listed)
-    begun = [text for text in listed if text.startswith(("=", "+", "-", "@", "\t", "\r"))]
-    assert [text for text in begun if not is_number(text)] == []
 
 
 @pytest.mark.slow

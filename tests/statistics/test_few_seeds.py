@@ -10,10 +10,10 @@ from mjx_reinforce.statistics.comparisons import (
     probability_of_improvement,
     seeds_needed,
 )
-from mjx_reinforce.statistics.survival import combined, log_rank, median_steps, restricted_mean
+from mjx_reinforce.statistics.survival import log_rank, median_steps, restricted_mean
 
-NAMES = ("mean", "median", "iqm", "cvar")
-MOST = "mean median iqm"
+NAMES = ("mean", "iqm", "cvar")
+MOST = "mean iqm"
 
 
 @pytest.mark.parametrize(
@@ -26,14 +26,14 @@ MOST = "mean median iqm"
         (np.arange(6.0), MOST),
         (np.arange(60.0), f"{MOST} cvar"),
         (np.full(5, 7.0), ""),
-        (np.full(6, 7.0), "median"),
-        (np.full(10, 7.0), "median"),
-        (np.full(11, 7.0), "median iqm"),
-        (np.full(60, 7.0), "median iqm"),
-        (0.1 + 1e-9 * np.arange(9), "median"),  # float32 numbers are not as exact
+        (np.full(6, 7.0), ""),
+        (np.full(10, 7.0), ""),
+        (np.full(11, 7.0), "iqm"),
+        (np.full(60, 7.0), "iqm"),
+        (0.1 + 1e-9 * np.arange(9), ""),  # float32 numbers are not as exact
         ([np.nan, 3.0], ""),
         ([np.nan] * 60, ""),
-        ([-np.inf, *range(59)], "median iqm"),
+        ([-np.inf, *range(59)], "iqm"),
         ([np.inf] * 30 + [5.0] * 30, ""),
         (np.repeat([0.0, 1.0], [10, 50]), MOST),  # of the worst tenth, all are alike
     ],
@@ -42,15 +42,6 @@ def test_an_interval_is_of_seeds_that_can_bear_it(values, bounded):
     for name in NAMES:
         found = interval(name, np.asarray(values))
         assert np.all(np.isfinite(found[1:])) == (name in bounded.split()), name
-
-
-def test_tasks_side_by_side_need_seeds_each():
-    """Three of each, and as many in all as leave five beside the tasks."""
-    for each, tasks, bounded in ((2, 20, False), (3, 2, False), (3, 3, True), (6, 1, True)):
-        strata, values = np.repeat(np.arange(tasks), each), np.arange(float(each * tasks))
-        for name in ("mean", "iqm"):
-            assert np.isfinite(interval(name, values, strata=strata).low) == bounded
-    assert np.isnan(interval("mean", np.repeat([1.0, 5.0], 9), strata=np.repeat([0, 1], 9)).low)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +76,6 @@ def test_no_p_of_times_is_less_than_their_orders_allow(seeds, least):
     test = log_rank(soon, all_of_them, late, all_of_them)
     assert test.p_value == pytest.approx(max(least, 0.01), abs=0.02)
     assert test.p_value >= least - 1e-12
-    assert combined([test.statistic]) == pytest.approx(test.p_value)
 
 
 @pytest.mark.parametrize(

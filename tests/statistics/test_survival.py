@@ -6,7 +6,6 @@ from scipy import stats
 
 from mjx_reinforce.statistics.survival import (
     collapses,
-    combined,
     kaplan_meier,
     log_rank,
     mean_while_training,
@@ -121,12 +120,6 @@ def test_log_rank_of_what_does_not_differ():
     none, all_of_them = np.zeros(4, bool), np.ones(4, bool)
     for solved in (none, all_of_them):
         assert log_rank([7] * 4, solved, [7] * 4, solved) == (0.0, 1.0)
-
-
-def test_tests_of_several_tasks_together():
-    assert combined([1.96]) == pytest.approx(0.05, abs=1e-3)
-    assert combined([2.0, -2.0]) == 1.0
-    assert combined([1.5] * 4) == pytest.approx(2 * stats.norm.sf(3.0))
 
 
 def test_mean_while_training_is_the_area_by_the_width():

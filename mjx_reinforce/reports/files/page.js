@@ -101,11 +101,8 @@
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 10000);
   };
-  // A name that a spreadsheet would take for a formula gets an apostrophe, as in report.py.
-  const noFormula = (text) =>
-    /^[=+\-@\t\r\n]/.test(text) && !Number.isFinite(Number(text)) ? `'${text}` : text;
   const quoted = (value) => {
-    const text = value === null ? "" : noFormula(String(value));
+    const text = value === null ? "" : String(value);
     return /[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
   };
   const csv = (listed) => listed.length
