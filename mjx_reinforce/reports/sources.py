@@ -165,8 +165,7 @@ def _check_seeds(configurations: Sequence[Configuration]) -> None:
 def _told_apart(sources: Sequence[Source]) -> list[Configuration]:
     """Returns all configurations, each with a label of its own and the settings that differ."""
     pairs = [(source, part) for source in sources for part in source.configurations]
-    # Runs of version 0.1 have no setting env_set.
-    full = [{"env_set": []} | source.settings | part.settings for source, part in pairs]
+    full = [source.settings | part.settings for source, part in pairs]
     names = dict.fromkeys(name for settings in full for name in settings)
     differ = [
         name
@@ -227,10 +226,12 @@ def read_directory(directory: Path) -> Source:
     Raises:
       ValueError: it is neither, or a file is missing or damaged: which, and what is wrong.
     """
-    if (directory / "sweep.json").is_file():
-        return read_sweep(directory)
-    if (directory / "config.json").is_file():
-        return read_run(directory)
+    for name, read in (("sweep.json", _read_sweep), ("config.json", _read_run)):
+        if (directory / name).is_file():
+            content = read_json(directory / name)
+            with naming_damage(directory / name):
+                check_type("env", content["env"], str)
+            return read(directory, content)
     if not directory.is_dir():
         raise ValueError(f"there is no directory {directory}; name that of a run or a sweep")
     raise ValueError(
@@ -238,56 +239,45 @@ def read_directory(directory: Path) -> Source:
     )
 
 
-def read_run(directory: Path) -> Source:
-    """Reads a run; raises as ``read_directory``."""
-    path, summary_path = directory / "config.json", directory / "summary.json"
-    config = read_json(path)
-    summary: dict[str, Any] = {"status": "running"}
-    if summary_path.exists():
-        summary = read_json(summary_path)
-    seeds = config.get("seeds")
+def _read_run(directory: Path, config: dict[str, Any]) -> Source:
+    """Reads a run with this config.json."""
+    path, seeds = directory / "summary.json", config.get("seeds")
+    summary: dict[str, Any] = read_json(path) if path.exists() else {"status": "running"}
     first = read_seeds(seeds).start if isinstance(seeds, str) else 0
     columns = read_metrics(directory / "metrics.csv", first)
-    seed = columns["seed"]
-    with naming_damage(summary_path):
-        events = np.array([event["seed"] for event in summary.get("nonfinite", [])], np.int64)
-        nonfinite = np.bincount(events - first, minlength=len(seed))[: len(seed)]
-        outcome = _outcome(summary)
-    where = [directory] * len(seed)
-    part = Configuration(directory.name, {}, nonfinite=nonfinite, where=where, **columns)
-    kept = {name: value for name, value in config.items() if name in PROVENANCE}
+    num_seeds = len(columns["seed"])
     with naming_damage(path):
-        check_type("env", config["env"], str)
+        events = np.array([event["seed"] for event in summary.get("nonfinite", [])], np.int64)
+        nonfinite = np.bincount(events - first, minlength=num_seeds)[:num_seeds]
+        outcome = _outcome(summary)
+    where = [directory] * num_seeds
+    kept = {name: value for name, value in config.items() if name in PROVENANCE}
     return Source(
         directory=directory,
         env=config["env"],
-        configurations=[part],
+        configurations=[
+            Configuration(directory.name, {}, nonfinite=nonfinite, where=where, **columns)
+        ],
         settings={name: value for name, value in config.items() if name not in PROVENANCE},
         provenance=kept | {"engine": summary.get("engine", config.get("engine"))},
         **outcome,
     )
 
 
-def read_sweep(directory: Path) -> Source:
-    """Reads a sweep; raises as ``read_directory``."""
-    path = directory / "sweep.json"
-    content = read_json(path)
+def _read_sweep(directory: Path, content: dict[str, Any]) -> Source:
+    """Reads a sweep with this sweep.json."""
     found = _read_curves(directory)
     if not len(found["seed"]):
         raise ValueError(f"{directory} has no results yet; wait for the first, or --resume it")
     parts = []
-    with naming_damage(path):
-        check_type("env", content["env"], str)
-        swept = {
-            f"configuration {each.pop('configuration')}": each for each in content["configurations"]
-        }
+    with naming_damage(directory / "sweep.json"):
+        swept = {f"configuration {x.pop('configuration')}": x for x in content["configurations"]}
         for number in np.unique(found["configuration"]):
             runs, settings = found["configuration"] == number, swept[f"configuration {number}"]
             columns = {name: found[name][..., runs] for name in _COLUMNS}
             where = [directory] * int(runs.sum())
-            parts.append(
-                Configuration(settings_in_words(settings), settings, where=where, **columns)
-            )
+            label = settings_in_words(settings)
+            parts.append(Configuration(label, settings, where=where, **columns))
         return Source(
             directory=directory,
             env=content["env"],
@@ -301,31 +291,26 @@ def read_sweep(directory: Path) -> Source:
 def _outcome(content: Mapping[str, Any]) -> dict[str, Any]:
     """Returns what a file says of ``threshold``, ``timings`` and ``status``."""
     names = ("threshold", *_TIMINGS)
-    numbers = {name: float(content[name]) for name in names if content.get(name) is not None}
-    threshold = numbers.pop("threshold", None)
-    return {
-        "threshold": threshold,
-        "timings": numbers,
-        "status": content.get("status", "finished"),
-    }
+    timings = {name: float(content[name]) for name in names if content.get(name) is not None}
+    threshold, status = timings.pop("threshold", None), content.get("status", "finished")
+    return {"threshold": threshold, "timings": timings, "status": status}
 
 
 def _read_curves(directory: Path) -> dict[str, np.ndarray]:
     """Returns the arrays of curves.npz, [R] or [E, R] of R runs, and ``nonfinite`` [R] of them."""
-    path = directory / "curves.npz"
-    arrays, rows = read_arrays(path), read_columns(directory / "results.csv", _RESULTS)
+    path, results = directory / "curves.npz", directory / "results.csv"
+    arrays, rows = read_arrays(path), read_columns(results, _RESULTS)
     with naming_damage(path):
         found = {name: arrays[name].astype(kind) for name, kind in _CURVES.items()}
         shapes = {name: x.shape[-1:] for name, x in found.items()}
         if len({*shapes.values()}) > 1 or len(found["eval_return"]) != len(found["env_steps"]):
             raise ValueError(f"its arrays are of different runs: {shapes}")
-    named = [
-        [f"configuration {i}, seed {s}" for i, s in zip(x["configuration"], x["seed"], strict=True)]
-        for x in (rows, found)
-    ]
-    with naming_damage(directory / "results.csv"):
-        counted = dict(zip(named[0], rows["nonfinite"], strict=True))
-        return found | {"nonfinite": np.array([counted[name] for name in named[1]], np.int64)}
+    row_of, run_of = (
+        [*zip(x["configuration"].tolist(), x["seed"].tolist(), strict=True)] for x in (rows, found)
+    )
+    with naming_damage(results):
+        counted = dict(zip(row_of, rows["nonfinite"], strict=True))
+        return found | {"nonfinite": np.array([counted[run] for run in run_of], np.int64)}
 
 
 def read_metrics(path: Path, first: int = 0) -> dict[str, np.ndarray]:
@@ -345,11 +330,8 @@ def read_metrics(path: Path, first: int = 0) -> dict[str, np.ndarray]:
         raise ValueError(f"{path} has no evaluation yet; wait for the first, or train again")
     num_seeds = max(int(seed.max()) - first, 0) + 1
     whole = len(seed) // num_seeds * num_seeds
-    wrong = np.flatnonzero(seed != first + np.arange(len(seed)) % num_seeds)
-    if len(wrong) or not whole:
-        row = int(wrong[0]) if len(wrong) else len(seed)
-        expected = first + row % num_seeds
-        raise ValueError(f"{path} is damaged: line {row + 2} is not of seed {expected}")
+    if not whole or (seed != first + np.arange(len(seed)) % num_seeds).any():
+        raise ValueError(f"{path} is damaged: its lines are not in the order of the seeds")
     shape = (-1, num_seeds)
     found = {name: columns[name][:whole].reshape(shape) for name in ("env_steps", "eval_return")}
     return found | {"seed": seed[:num_seeds]}
@@ -369,22 +351,9 @@ def read_columns(path: Path, kinds: Mapping[str, Any]) -> dict[str, np.ndarray]:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ValueError(f"cannot read {path} ({reason})") from error
+        raise ValueError(f"cannot read {path} ({error})") from error
     header, *rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines())) or [[]]
-    for name in kinds:
-        if name not in header:
-            raise ValueError(f"{path} is damaged: it has no column {name}")
-    for line, row in enumerate(rows, start=2):
-        if len(row) != len(header):
-            raise ValueError(
-                f"{path} is damaged: line {line} has {len(row)} entries, not {len(header)}"
-            )
-    found = {}
-    for name, kind in kinds.items():
-        column = header.index(name)
-        try:
-            found[name] = np.array([row[column] for row in rows], dtype=kind)
-        except ValueError as error:  # it has the text
-            raise ValueError(f"{path} is damaged: in the column {name}, {error}") from None
-    return found
+    with naming_damage(path):
+        entries = zip(*rows, strict=True) if rows else [()] * len(header)
+        columns = dict(zip(header, entries, strict=True))
+        return {name: np.array(columns[name], kind) for name, kind in kinds.items()}

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from mjx_reinforce.reports.sources import read_metrics, read_run, read_sweep
+from mjx_reinforce.reports.sources import read_directory, read_metrics
 
 HEADER = "seed,env_steps,eval_return,entropy\n"
 ROWS = ["0,10,1.5,2\n", "1,12,-0.5,2\n", "0,20,nan,2\n", "1,22,3.0,2\n"]
@@ -20,7 +20,7 @@ def run(tmp_path):
 
 
 def test_a_run_that_goes_on(run):
-    source = read_run(run)
+    source = read_directory(run)
     [part] = source.configurations
     assert (source.env, source.status, source.threshold) == ("Hopper-v5", "running", None)
     assert source.settings == {"env": "Hopper-v5", "learning_rate": 0.01, "engine": "auto"}
@@ -40,7 +40,7 @@ def test_a_run_that_ended(run):
         "compile_seconds": None,
     }
     (run / "summary.json").write_text(json.dumps(summary))
-    source = read_run(run)
+    source = read_directory(run)
     assert (source.status, source.threshold) == ("finished", 3000.0)
     assert source.provenance["engine"] == "native"
     assert source.timings == {"run_seconds": 2.5}
@@ -58,11 +58,11 @@ def test_a_last_evaluation_that_is_not_whole_is_left_out(run, end):
     ("text", "message"),
     [
         (HEADER, "has no evaluation yet"),
-        ("seed,env_steps\n0,1\n", "has no column eval_return"),
-        (HEADER + "0,10,high,2\n", "in the column eval_return, could not convert .* 'high'"),
-        (HEADER + ROWS[0] + "1,12\n", "line 3 has 2 entries, not 4"),
-        (HEADER + "".join(ROWS[i] for i in (0, 1, 3, 2)), "line 4 is not of seed 0"),
-        (HEADER + ROWS[1], "line 2 is not of seed 0"),
+        ("seed,env_steps\n0,1\n", "eval_return is missing"),
+        (HEADER + "0,10,high,2\n", "could not convert .* 'high'"),
+        (HEADER + ROWS[0] + "1,12\n", "is shorter"),
+        (HEADER + "".join(ROWS[i] for i in (0, 1, 3, 2)), "order of the seeds"),
+        (HEADER + ROWS[1], "order of the seeds"),
     ],
 )
 def test_a_damaged_table_is_named_with_its_line(run, text, message):
@@ -94,7 +94,7 @@ def test_a_table_that_cannot_be_read(run):
 def test_a_damaged_file_of_a_run_is_named(run, name, entry, said):
     (run / f"{name}.json").write_text(json.dumps(entry))
     with pytest.raises(ValueError, match=f"{name}.json is damaged: .*{said}"):
-        read_run(run)
+        read_directory(run)
 
 
 CONTENT = {
@@ -133,7 +133,7 @@ def sweep(tmp_path):
 
 
 def test_a_sweep_that_was_interrupted(sweep):
-    source = read_sweep(sweep())
+    source = read_directory(sweep())
     first, second = source.configurations
     assert (source.env, source.threshold, source.status) == ("Hopper-v5", 3000.0, "interrupted")
     assert (first.label, second.label) == ("learning rate 0.1", "learning rate 0.2")
@@ -157,7 +157,7 @@ def test_a_sweep_that_was_interrupted(sweep):
 )
 def test_a_damaged_sweep_json_is_named(sweep, change, message):
     with pytest.raises(ValueError, match=f"sweep.json is damaged: .*{message}"):
-        read_sweep(sweep(content=CONTENT | change))
+        read_directory(sweep(content=CONTENT | change))
 
 
 @pytest.mark.parametrize(
@@ -167,15 +167,15 @@ def test_a_damaged_sweep_json_is_named(sweep, change, message):
         ({"seed": np.array(["a", "b", "c"])}, "curves.npz is damaged: invalid literal .*'a'"),
         ({"seed": np.zeros(2, int)}, "curves.npz is damaged: its arrays .*'seed': .2,"),
         ({"env_steps": np.zeros((1, 3))}, "curves.npz is damaged: its arrays"),
-        ({"seed": np.array([0, 0, 2])}, "results.csv is damaged: configuration 1, seed 2 is miss"),
+        ({"seed": np.array([0, 0, 2])}, "results.csv is damaged: .1, 2. is miss"),
     ],
 )
 def test_damaged_curves_are_named(sweep, arrays, message):
     with pytest.raises(ValueError, match=message):
-        read_sweep(sweep(**arrays))
+        read_directory(sweep(**arrays))
 
 
 def test_a_sweep_without_results(sweep):
     nothing = {name: x[..., :0] for name, x in ARRAYS.items()}
     with pytest.raises(ValueError, match="has no results yet"):
-        read_sweep(sweep(**nothing))
+        read_directory(sweep(**nothing))
