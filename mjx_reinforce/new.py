@@ -3,9 +3,9 @@
 import dataclasses
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -75,15 +75,10 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
     """
     timestep = float(model.opt.timestep)
     frame_skip = max(1, round(0.04 / timestep))
-    walks = model.njnt > 0 and _kind(model, 0) == "free"
-    seen, observed = ["positions (m, rad)", "speeds (m/s, rad/s)"], ["data.qpos", "data.qvel"]
-    if walks:
-        observed[0] = "data.qpos[2:]"
-    if model.nsensordata:
-        seen.append("sensors")
-        observed.append("data.sensordata")
+    free = [i for i in range(model.njnt) if model.jnt_type[i] == 0]
     pose = "self.mj_model.key_qpos[0]" if model.nkey else "self.mj_model.qpos0"
-    height = float((model.key_qpos[0] if model.nkey else model.qpos0)[2]) if walks else 0.0
+    height = float((model.key_qpos[0] if model.nkey else model.qpos0)[2]) if free else 0.0
+    observed = ["data.qpos[2:]" if free == [0] else "data.qpos", "data.qvel"]
     template = Path(__file__).with_name("new_task.txt").read_text("utf-8")
     return template.format(
         title=_title(module),
@@ -95,88 +90,59 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
         nq=model.nq,
         nv=model.nv,
         pose=pose,
-        pose_name="key frame 0" if model.nkey else "the model's pose",
         unit="".join(_unit_quaternions(model)),
-        walking=_WALKING.format(low=height / 2) if walks else "",
-        seen=", ".join(seen),
-        observed=", ".join(observed),
-        without="  # without x and y" if walks else "",
-        about=_about(model),
+        walking=_WALKING.format(low=height / 2) if free == [0] else "",
+        observed=", ".join(observed + ["data.sensordata"] * (model.nsensordata > 0)),
+        about="".join(_about(model)),
     )
 
 
 def _title(module: str) -> str:
     """Returns the name of the class in a module: my_arm -> MyArm."""
-    words = [word for word in module.split("_") if word]
-    title = "".join(word[:1].upper() + word[1:] for word in words)
+    title = "".join(word[:1].upper() + word[1:] for word in module.split("_"))
     return title if title.isidentifier() else f"Robot{title}"
 
 
-def _kind(model: "MjModel", joint: int) -> str:
-    return ("free", "ball", "slide", "hinge")[int(model.jnt_type[joint])]
+def _size(model: "MjModel", joint: int) -> int:
+    """Returns how many entries of qpos a joint has: free, ball, slide or hinge."""
+    return (7, 4, 1, 1)[int(model.jnt_type[joint])]
 
 
-def _unit_quaternions(model: "MjModel") -> Iterable[str]:
+def _unit_quaternions(model: "MjModel") -> Iterator[str]:
     """Yields a line for each quaternion of qpos, which noise makes longer or shorter."""
     for joint in range(model.njnt):
-        if (kind := _kind(model, joint)) in ("free", "ball"):
-            first = int(model.jnt_qposadr[joint]) + 3 * (kind == "free")
-            part = f"{first}:{first + 4}"
+        if (size := _size(model, joint)) > 1:
+            end = int(model.jnt_qposadr[joint]) + size
+            part = f"{end - 4}:{end}"
             yield f"        qpos = qpos.at[{part}].divide(jnp.linalg.norm(qpos[{part}]))\n"
 
 
-def _about(model: "MjModel") -> str:
-    """Returns the docstring of the class: its positions, its actions, and what has a name."""
-    joints = _listed(
-        f"{_safe_name(model.joint(i).name, 'joint', i)} at {_place(model, i)}"
-        for i in range(model.njnt)
-    )
-    actions = _listed(
-        f"{_safe_name(_moved(model, i), 'actuator', i)}{_control_range(model, i)}"
-        for i in range(model.nu)
-    )
-    counts = {"site": model.nsite, "body": model.nbody}
-    named = ((kind, getattr(model, kind)(i).name) for kind in counts for i in range(counts[kind]))
-    places = _listed(
-        f"data.{kind}({json.dumps(name)}).xpos" for kind, name in named if name not in ("", "world")
-    )
-    said = f"What it should do.\n\n    Joints:\n{joints}\n    Actions:\n{actions}"
-    return f"{said}\n    Places (m):\n{places}    " if places else f"{said}    "
-
-
-def _place(model: "MjModel", joint: int) -> str:
-    """Returns where the position of a joint is."""
-    first, kind = int(model.jnt_qposadr[joint]), _kind(model, joint)
-    if size := {"free": 7, "ball": 4}.get(kind):
-        return f"qpos[{first}:{first + size}], {kind}"
-    return f"qpos[{first}]"
-
-
-def _listed(lines: Iterable[str]) -> str:
-    return "".join(f"      {line}\n" for line in lines)
+def _about(model: "MjModel") -> Iterator[str]:
+    """Yields the lines of the class's docstring: its positions, its actions, and its places."""
+    yield "    Joints:\n"
+    for i in range(model.njnt):
+        first, size = int(model.jnt_qposadr[i]), _size(model, i)
+        where = f"{first}:{first + size}" if size > 1 else first
+        yield f"      {_safe_name(model.joint(i).name, 'joint', i)} at qpos[{where}]\n"
+    yield "    Actions:\n"
+    for i in range(model.nu):
+        low, high = model.actuator_ctrlrange[i]
+        limits = f"in [{low:g}, {high:g}]" if model.actuator_ctrllimited[i] else "unlimited"
+        moved = (
+            model.joint(model.actuator_trnid[i, 0]).name if model.actuator_trntype[i] == 0 else ""
+        )
+        name = _safe_name(model.actuator(i).name or moved, "actuator", i)
+        yield f"      {name}, {limits}\n"
+    yield "    Places (m):\n"
+    for kind, count in (("site", model.nsite), ("body", model.nbody)):
+        for name in (getattr(model, kind)(i).name for i in range(count)):
+            if name not in ("", "world"):
+                yield f"      data.{kind}({json.dumps(name)}).xpos\n"
 
 
 def _safe_name(name: str, kind: str, number: int) -> str:
     """Returns a name that is safe in a docstring, or what has none."""
     return re.sub(r'["\\\n]', "_", name) or f"{kind} {number}"
-
-
-def _moved(model: "MjModel", number: int) -> str:
-    """Returns the name of an actuator, or of the joint that it moves."""
-    import mujoco
-
-    kinds: Any = mujoco
-    joints = int(kinds.mjtTrn.mjTRN_JOINT), int(kinds.mjtTrn.mjTRN_JOINTINPARENT)
-    name = model.actuator(number).name
-    if not name and model.actuator_trntype[number] in joints:
-        return model.joint(model.actuator_trnid[number, 0]).name
-    return name
-
-
-def _control_range(model: "MjModel", number: int) -> str:
-    low, high = model.actuator_ctrlrange[number]
-    limits = f" in [{low:g}, {high:g}]" if model.actuator_ctrllimited[number] else ", unlimited"
-    return f"{limits}, {model.key_ctrl[0, number]:g} in key frame 0" if model.nkey else limits
 
 
 if __name__ == "__main__":
