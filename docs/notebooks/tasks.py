@@ -12,14 +12,13 @@ import matplotlib.pyplot as plt
 
 import mjx_reinforce as mr
 
-SECONDS = 60
 TASKS = ("InvertedPendulum-v5", "Reacher-v5", "Swimmer-v5", "Hopper-v5", "HalfCheetah-v5")
 
 # %%
 trained = {}
 for task in TASKS:
     begin = time.perf_counter()
-    config = mr.of_task(task, num_seeds=2, seconds=SECONDS)
+    config = mr.of_task(task, num_seeds=2)
     trained[task] = mr.run(config, quiet=True)
     print(
         f"{task}: {trained[task].test_returns.mean():.0f} after {config.env_steps:,} env steps a seed,"

@@ -18,30 +18,27 @@ from mjx_reinforce.settings.config import CODE, Config, spoken
 
 #: Where a budget is large, it has about so many evaluations.
 _EVALUATIONS = 50
-#: Of a long run, the time between two evaluations (s), with as many seeds as a default run has.
-_BETWEEN = 20.0
-#: A default run trains for about so long (s) with as many seeds as a default run has, and never
-#: less than the task's settings in ``tuned`` say.
-_DEFAULT_SECONDS = 60.0
-#: CPU cores that make a run faster; it was not tried with more.
-_USEFUL_CORES = 4
+#: In a long run it has so many a minute, of as many seeds as a default run has.
+_A_MINUTE = 3
 
 
 def of_task(
     env: str,
     env_steps: int | None = None,
     num_seeds: int = Config.num_seeds,
-    seconds: float | None = None,
+    minutes: float | None = None,
 ) -> Config:
     """Returns the default settings for an environment, also for one that the table lacks.
 
+    What is made for a smaller budget is stretched: schedules that would end before the run are as
+    long as it, and where episodes are long there are no more than some fifty evaluations.
+
     Args:
       env: its id.
-      env_steps: the budget of a seed; None: what a time of training gives on this machine, but no
-        less than the task's settings in ``tuned`` say.
+      env_steps: the budget of a seed; None: what about a minute of training gives.
       num_seeds: that train together. More than a default run has change nothing: what a seed
         learns is then the same, and takes longer.
-      seconds: that time; None: about a minute, or less where nothing more is to be had.
+      minutes: what the settings are for in place of a budget.
 
     Examples:
       >>> import dataclasses
@@ -50,69 +47,26 @@ def of_task(
       >>> dataclasses.replace(config, num_seeds=8).num_seeds, config.env_steps
       (8, 20000)
     """
-    known = tables.OF_TASKS.get(env)
-    few = dataclasses.replace(Config(env=env, num_seeds=num_seeds), **(known or {}))
-    if env_steps is None and seconds is None and (env in tables.SOLVED or known is None):
+    few = dataclasses.replace(Config(env=env, num_seeds=num_seeds), **tables.OF_TASKS.get(env, {}))
+    config = few
+    minute = tables.MINUTES[env][has_gpu()] if env in tables.MINUTES else 0
+    if env_steps is None and minutes is None and not minute:
         return few
-    rows = [(0, few)]
+    budget = env_steps or max(1, round((minutes or 1) * (minute or few.env_steps or 0)))
     for least, settings in tables.OF_BUDGETS.get(env, ()):
-        rows.append((least, dataclasses.replace(few, **settings)))
-    if env_steps is not None:
-        chosen = next(config for least, config in reversed(rows) if env_steps >= least)
-        return _with_budget(chosen, env_steps)
-    given, chosen = _in_time(seconds or _DEFAULT_SECONDS, rows)
-    if seconds is None:
-        given = min(given, tables.ENOUGH.get(env, given))
-    return _with_budget(chosen, max(given, 1 if seconds else few.env_steps or 0))
-
-
-def _in_time(seconds: float, rows: Sequence[tuple[int, Config]]) -> tuple[int, Config]:
-    """Returns the budget that a time gives here, and the settings for it.
-
-    Args:
-      seconds: the time.
-      rows: from so many env steps on, the settings; the least first, which is 0. On a GPU the last
-        hold in any case: few episodes take as long there as many.
-    """
-    for least, config in reversed(rows):
-        together = min(config.num_seeds, Config.num_seeds)
-        given = expected_env_steps(seconds, dataclasses.replace(config, num_seeds=together))
-        if has_gpu() or given >= least:
-            return given, config
-    raise AssertionError("the first row holds for any budget")
-
-
-def _with_budget(config: Config, env_steps: int) -> Config:
-    """Returns settings with a budget, to which what is made for a smaller one is stretched.
-
-    Schedules that would end before it are as long as it. Where episodes are long there are no more
-    evaluations than ``_EVALUATIONS``, except in a run so long that an interrupt, which waits for
-    the updates between two, would wait for more than ``_BETWEEN``.
-    """
-    config = dataclasses.replace(config, env_steps=env_steps)
-    if isinstance(config.decay_steps, int) and config.decay_steps < env_steps:
+        # On a GPU few episodes take as long as many.
+        if budget >= least or (env_steps is None and has_gpu()):
+            config = dataclasses.replace(few, **settings)
+    config = dataclasses.replace(config, env_steps=budget)
+    if isinstance(config.decay_steps, int) and config.decay_steps < budget:
         config = dataclasses.replace(config, decay_steps="budget")
-    if config.env not in tables.TASKS:
+    if env not in tables.TASKS:
         return config
-    horizon = config.training_horizon(tables.TASKS[config.env].horizon)
-    played = config.episodes_per_update * horizon
-    usual = dataclasses.replace(config, num_seeds=Config.num_seeds)
-    every = min(env_steps // _EVALUATIONS, expected_env_steps(_BETWEEN, usual)) // played
+    # In a run so long that an interrupt, which waits for the updates between two evaluations, would
+    # wait long, there are a few a minute.
+    every = min(budget // _EVALUATIONS, minute // _A_MINUTE or budget)
+    every //= config.episodes_per_update * config.training_horizon(tables.TASKS[env].horizon)
     return dataclasses.replace(config, eval_every=max(config.eval_every, every))
-
-
-def expected_env_steps(seconds: float, config: Config) -> int:
-    """Returns about how many env steps of a seed this machine trains in a time, to two digits.
-
-    A task that was not measured has those of its default budget.
-    """
-    machine = tables.GPU if has_gpu() else tables.CPU
-    if config.env not in machine:
-        return config.env_steps or 0
-    episodes = config.num_seeds * config.episodes_per_update
-    each = machine[config.env].seconds(config.num_seeds, episodes)  # an env step of every seed
-    steps = seconds * (1.0 if has_gpu() else cpu_factor()) / each
-    return int(float(f"{steps:.2g}"))
 
 
 def num_cores() -> int:
@@ -124,11 +78,6 @@ def num_cores() -> int:
 def has_gpu() -> bool:
     """Returns whether JAX is likely to find an NVIDIA GPU; JAX is not imported."""
     return may_have_accelerator() and any(Path("/dev").glob("nvidia[0-9]*"))
-
-
-def cpu_factor() -> float:
-    """Returns how many times as fast as two cores this machine's are together."""
-    return min(num_cores(), _USEFUL_CORES) / 2
 
 
 def may_have_accelerator() -> bool:
@@ -166,5 +115,4 @@ def for_arguments(arguments: Sequence[str]) -> Config:
 
     env, minutes = flag_value(arguments, "--env") or Config.env, given("--minutes", float)
     num_seeds = given("--num-seeds", whole_number) or Config.num_seeds
-    seconds = None if minutes is None else 60 * minutes
-    return of_task(env, given("--env-steps", whole_number), num_seeds, seconds)
+    return of_task(env, given("--env-steps", whole_number), num_seeds, minutes)

@@ -1,7 +1,7 @@
 """The values that stand in TOML files: presets, what searches found, what was measured.
 
 ``presets.toml`` has published programs under names for the command line, ``tuned.toml`` settings
-by task and budget, ``measured.toml`` what the tasks take; each explains its words.
+by task and budget, ``measured.toml`` the sizes of the tasks; each explains its words.
 """
 
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ PRESETS: dict[str, tuple[str, Config]] = {
 
 
 #: What a table says beside settings.
-_NO_SETTINGS = ("task", "at_least", "solved", "enough")
+_NO_SETTINGS = ("task", "at_least", "minute")
 _ROWS = [table for table in read_tables("tuned.toml").values() if "task" in table]
 
 
@@ -33,10 +33,10 @@ OF_BUDGETS: dict[str, list[tuple[int, dict[str, Any]]]] = {}
 for _row in _ROWS:
     if "at_least" in _row:
         OF_BUDGETS.setdefault(_row["task"], []).append((_row["at_least"], _without_facts(_row)))
-#: Nothing more is to be had of these in a minute than in what is said above,
-SOLVED = tuple(task for task, row in _SMALLEST.items() if row.get("solved"))
-#: or than in so many env steps of a seed.
-ENOUGH = {task: row["enough"] for task, row in _SMALLEST.items() if "enough" in row}
+#: Environment id -> the env steps of a seed that a default run trains, on a CPU and on a GPU.
+MINUTES: dict[str, tuple[int, int]] = {
+    task: row["minute"] for task, row in _SMALLEST.items() if "minute" in row
+}
 
 
 class Task(NamedTuple):
@@ -54,23 +54,5 @@ class Task(NamedTuple):
     base_memory: float
 
 
-class Speed(NamedTuple):
-    """How fast machine code plays and trains on a task.
-
-    latency: one env step of however few episodes (s)
-    rate: env steps a second of however many
-    """
-
-    latency: float
-    rate: float
-
-    def seconds(self, steps: float, episodes: int) -> float:
-        """Returns how long ``steps`` env steps take, ``episodes`` at a time (s)."""
-        return steps / episodes * (self.latency + episodes / self.rate)
-
-
-_TABLES = read_tables("measured.toml")
-#: Environment id -> its sizes, and its speed on two CPU cores, and on one GPU.
-TASKS = {name: Task(**table["sizes"]) for name, table in _TABLES.items()}
-CPU = {name: Speed(**table["cpu"]) for name, table in _TABLES.items()}
-GPU = {name: Speed(**table["gpu"]) for name, table in _TABLES.items()}
+#: Environment id -> its sizes.
+TASKS = {name: Task(**table["sizes"]) for name, table in read_tables("measured.toml").items()}
