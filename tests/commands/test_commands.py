@@ -216,7 +216,7 @@ MISTAKES = {
     "sweep --over learning-rat 1 2": "Did you mean 'learning-rate'?",
     "report": "there is nothing to report on: name a run or a sweep directory",
     "report nowhere": "there is no directory nowhere; name that of a run or a sweep",
-    "export": "RUN",
+    "export": "Missing from mjx-reinforce export",
 }
 
 
