@@ -29,11 +29,7 @@ os.environ.setdefault(
 import jax
 import pytest
 from command_lines import added_environments, run_command
-from verify import verify
 
-from mjx_reinforce.engine.scalar import scalarized
-
-scalarized.inspect = verify
 jax.config.update("jax_default_matmul_precision", "highest")
 
 

@@ -18,7 +18,6 @@ from mujoco import mjx
 from mjx_reinforce import Environment, envs, watch
 from mjx_reinforce.engine.base import Discrete, action_space, null_action, observation_size
 from mjx_reinforce.engine.checks import BadEnvironmentError
-from mjx_reinforce.engine.contract import check_shape
 from mjx_reinforce.engine.physics.mjx_internals import fenced
 from mjx_reinforce.engine.play import objects
 from mjx_reinforce.envs.outcomes import check_outcome, check_start
@@ -135,16 +134,12 @@ def test_settings_are_frozen_and_gymnasiums(ids):
     [
         ("InvertedPendulm-v5", {}, "Did you mean 'InvertedPendulum-v5'"),
         ("Hopper-v5", {"helthy_reward": 1}, "of Hopper 'helthy_reward'.*'healthy_reward'.*Known"),
-        ("CartPole-v1", {"sutton": True}, "of CartPole 'sutton'.*'sutton_barto_reward'"),
         ("InvertedPendulum-v5", {"solver": "mjxx"}, "unknown solver 'mjxx'"),
-        ("InvertedPendulum-v5", {"frame_skip": 0}, "frame_skip must be at least 1, got 0"),
         ("CartPole-v1", {"max_episode_steps": 0}, "max_episode_steps must be at least 1, got 0"),
         ("CartPole-v1", {"kinematics_integrator": "rk4"}, "unknown integrator 'rk4'"),
         ("Swimmer-v5", {"reset_noise_scale": -0.1}, "reset_noise_scale must be 0 or more"),
         ("Hopper-v5", {"healthy_state_range": (1, 1)}, "healthy_state_range must be"),
-        ("Walker2d-v5", {"healthy_angle_range": (1, -1)}, "healthy_angle_range must be"),
         ("Humanoid-v5", {"healthy_z_range": (2, 1)}, "healthy_z_range must be"),
-        ("Humanoid-v5", {"contact_cost_range": (2, 1)}, "contact_cost_range must be"),
         ("HumanoidStandup-v5", {"impact_cost_range": (2, 1)}, "impact_cost_range must be"),
         ("Ant-v5", {"contact_force_range": (2, 1)}, "contact_force_range must be"),
         ("Ant-v5", {"main_body": "tail"}, "main_body 'tail' is not in ant.xml"),
@@ -233,16 +228,6 @@ def equal(x, y):
     jax.tree.map(np.testing.assert_array_equal, x, y)
 
 
-def test_register_once():
-    envs.register("Again-v0", envs.make, id="InvertedPendulum-v5")
-    try:
-        assert "Again-v0" in envs.names()
-        with pytest.raises(ValueError, match="already registered"):
-            envs.register("Again-v0", envs.make)
-    finally:
-        del envs._TABLE["Again-v0"]
-
-
 # -------------------------------------------------------------------------------------------------
 # Checks of what a task's methods return: a wrong shape is named in one line.
 
@@ -259,11 +244,8 @@ def test_a_start_of_the_model_s_sizes_passes():
     ("start", "message"),
     [
         (np.zeros(3), r"must return qpos and qvel, got the shape \[3\]"),
-        ((np.zeros(3),), "got a tuple of 1"),
         ((np.zeros(2), np.zeros(2)), r"must return qpos \[3\], .* got the shape \[2\]"),
         ([np.zeros(3), np.zeros((2, 1))], r"must return qvel \[2\]"),
-        ((np.zeros(3), "fast"), "got 'fast'"),
-        (None, "got None"),
     ],
 )
 def test_a_start_of_other_sizes_is_named(start, message):
@@ -282,7 +264,6 @@ def test_an_outcome_of_scalars_passes():
         ((1.0, False), "must return three values, .* got a tuple of 2"),
         ((1.0, False, 3), "third value of Task.outcome must be a dict of the reward's terms, got"),
         ((np.zeros(1), False, {}), r"the reward of .* must be a scalar \[\], got the shape \[1\]"),
-        ((1.0, np.zeros(2, bool), {}), "the termination of"),
         ((1.0, False, {"cost": np.zeros(4)}), "the term 'cost' of .* sum it, or take an entry"),
         ((None, False, {}), "the reward of .* got None"),
     ],
@@ -290,12 +271,6 @@ def test_an_outcome_of_scalars_passes():
 def test_another_outcome_is_named(outcome, message):
     with pytest.raises(BadEnvironmentError, match=message):
         check_outcome("Task", outcome)
-
-
-def test_a_shape():
-    check_shape("qpos", np.zeros((2, 3)), (2, 3))
-    with pytest.raises(ValueError, match=r"qpos must be \[2\], got the shape \[3\]"):
-        check_shape("qpos", np.zeros(3), (2,))
 
 
 # -------------------------------------------------------------------------------------------------

@@ -21,27 +21,23 @@ SCENE = """
 </worldbody></mujoco>"""
 
 
-def _feet(dims, beside=""):
-    """A body on feet, three of each of some dimensions, with a limit, and what is beside it."""
+def _feet(dims):
+    """A body on feet, three of each of some dimensions, with a limit."""
     feet = "".join(
         f'<geom type="sphere" size="0.1" pos="{0.3 * x} {0.3 * y} 0" condim="{dim}" priority="1"/>'
         for x in range(3)
         for y, dim in enumerate(dims)
     )
     return f"""
-<mujoco><worldbody><geom type="plane" size="5 5 1" contype="3" conaffinity="3"/>
+<mujoco><worldbody><geom type="plane" size="5 5 1"/>
   <body pos="0 0 0.1"><inertial pos="0 0 0" mass="1" diaginertia="0.1 0.2 0.3"/>
     <joint type="slide" axis="0 0 1"/><joint axis="1 0 0"/>
-    <joint axis="0 1 0" range="-0.2 0.2" limited="true"/>{feet}</body>{beside}
+    <joint axis="0 1 0" range="-0.2 0.2" limited="true"/>{feet}</body>
 </worldbody></mujoco>"""
 
 
 THREE_FEET = _feet([1])
-FEET = _feet(
-    (1, 3, 4, 6),
-    """<body pos="0.5 0.4 0.2"><joint type="slide" axis="1 0 0"/>
-    <geom type="capsule" size="0.1 0.2" condim="1"/></body>""",
-)
+FEET = _feet((1, 3, 4, 6))
 
 
 class Scene(Survive):

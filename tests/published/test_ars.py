@@ -5,11 +5,10 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import Chain, SignedTarget, Survive, Target, Tempting
+from toys import SignedTarget, Survive, Target, Tempting
 
 from mjx_reinforce import deterministic, evaluate, mlp_policy, rollout, train_step
-from mjx_reinforce.engine.base import Discrete
-from mjx_reinforce.learning import counts, normalize
+from mjx_reinforce.learning import counts
 from mjx_reinforce.published.ars import ars
 from mjx_reinforce.published.continuous_cartpole import increment, random_search
 from mjx_reinforce.settings.config import Config
@@ -120,15 +119,6 @@ def test_the_best_action_is_found():
     assert float(result["eval_return"]) > -0.03
 
 
-def test_discrete_actions():
-    class DiscreteChain(Chain):
-        action_space = Discrete(2)
-        action_size = 2
-
-    _, _, metrics = train(DiscreteChain(), 100, step_size=0.1, noise_std=0.3, engine="vmap")
-    assert float(metrics["episode_return_max"][-1]) == pytest.approx(1.0 + 0.7 + 3.0)
-
-
 @pytest.mark.slow
 def test_seeds_together_and_standing_still():
     learner = ars(Survive(), num_directions=4, noise_std=0.5)
@@ -162,12 +152,6 @@ def test_hyperparameters_vmap_and_keys_are_used_once():
         state = jax.jit(learner.init)(jax.random.key(0))
         state, _ = train_step(learner, state)
         train_step(learner, state)
-
-
-@pytest.mark.slow
-def test_observations_may_stay_as_they_are():
-    _, state, _ = train(Survive(), 5, num_directions=4, normalize_steps=0)
-    jax.tree.map(np.testing.assert_array_equal, state.actor.normalizer, normalize.init(1))
 
 
 @pytest.mark.parametrize(

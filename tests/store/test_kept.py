@@ -28,14 +28,6 @@ from mjx_reinforce.store import kept, ready
 from mjx_reinforce.training.slots import compile_run
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=4000, eval_episodes=2)
-SETTINGS = {
-    "all else": {
-        "estimator": "value-baseline",
-        "optimizer": "sgd",
-        "decay_steps": None,
-    },
-    "search": {"algorithm": "ars", "hidden_sizes": (), "engine": "vmap"},
-}
 
 
 @pytest.fixture(autouse=True)
@@ -79,9 +71,9 @@ def numbers(prepared, config):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SETTINGS)
-def test_a_second_start_traces_nothing_and_gives_the_same(name, monkeypatch):
-    config = dataclasses.replace(CONFIG, **SETTINGS[name])
+def test_a_second_start_traces_nothing_and_gives_the_same(monkeypatch):
+    settings = {"estimator": "value-baseline", "optimizer": "sgd", "decay_steps": None}
+    config = dataclasses.replace(CONFIG, **settings)
     plain = ready.made(envs.make(config.env), config)
     first = ready.get_ready(config, config)
     expected = numbers(first, config)

@@ -89,11 +89,8 @@ def mine(tmp_path, monkeypatch):
     ("own", "said"),
     [
         ({"estimator": "mine:nothing"}, "what mine:nothing returns must be of type Estimator"),
-        ({"policy": "mine:nothing"}, "what mine:nothing returns must be of type Distribution"),
         ({"algorithm": "mine:nothing"}, "what mine:nothing returns must be of type Learner"),
         ({"estimator": "mine:broken"}, r"estimator 'mine:broken': RuntimeError: no luck .mine.py,"),
-        ({"policy": "mine:broken"}, "cannot build the policy 'mine:broken': RuntimeError: no luck"),
-        ({"algorithm": "mine:broken"}, "cannot build the algorithm 'mine:broken': RuntimeError"),
         ({"algorithm": "mine:forgetful"}, "must also return the metrics episodes, episode_return"),
         ({"algorithm": "mine:shapeless"}, "must return a state of the structure, shapes and"),
         ({"estimator": "mine:absent"}, "cannot import the estimator 'mine:absent'"),

@@ -16,9 +16,6 @@ from mjx_reinforce.engine.scalar.graph import Graph, Limits
 from mjx_reinforce.engine.scalar.nodes import Scalar
 from mjx_reinforce.engine.scalar.passes import liveness
 
-#: Looks at every program that was written out. The tests set it to ``verify``; users leave it.
-inspect: Callable[["Scalarized"], None] | None = None
-
 
 @dataclasses.dataclass(frozen=True)
 class Scalarized:
@@ -94,7 +91,7 @@ def build(
         results = evaluate.run(graph, program, inputs)
     outputs = [arrays.elements(result) for result in results]
     out_avals, out_tree = jax.tree.flatten(out_shape)
-    written = Scalarized(
+    return Scalarized(
         in_avals=[variable.aval for variable in program.jaxpr.invars],
         out_tree=out_tree,
         out_avals=out_avals,
@@ -102,9 +99,6 @@ def build(
         schedule=liveness.schedule(graph.scope, (x for leaf in outputs for x in leaf)),
         captures=bool(graph.captured),
     )
-    if inspect is not None:
-        inspect(written)
-    return written
 
 
 def _input_array(graph: Graph, number: int, aval: Any, varying: bool) -> np.ndarray:

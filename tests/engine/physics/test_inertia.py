@@ -147,29 +147,12 @@ def test_zeros_stay_zeros():
 # A step of ``implicitfast`` is that of C MuJoCo, also where actuators are clamped.
 
 BOX = '<geom type="box" size=".1 .2 .3"/>'
-#: A hinge each: its actuators; after a bar, attributes of the joint.
+#: A hinge each, with an actuator at its clamp; tests/experiments/test_matrix.py has all of them.
 HINGES = {
-    "servo": '<position joint="{0}" kp="20" kv="1"/>',
     "servo at its limit": '<position joint="{0}" kp="200" kv="20" forcerange="-3 3"/>',
-    "servo below its limit": '<position joint="{0}" kp="2" kv="2" forcerange="-30 30"/>',
-    "servo, joint's limit": '<position joint="{0}" kp="200" kv="20"/>|actuatorfrcrange="-1 1"',
-    "servo, activated":
-        '<position joint="{0}" kp="20" kv="2" timeconst=".1" forcerange="-.5 .5"/>',
-    "damper": '<damper joint="{0}" kv="3" ctrlrange="0 2"/>',
     "damper, more control than its range": '<damper joint="{0}" kv="3" ctrlrange="0 .5"/>',
-    "damper, activated":
-        '<general joint="{0}" dyntype="filter" dynprm=".1" gaintype="affine" gainprm="1 .2 -3"/>',
-    "velocity at its limit": '<velocity joint="{0}" kv="3" forcerange="-.1 .1"/>',
     "muscle": '<muscle joint="{0}" lengthrange="-2 2" force="30"/>',
-    "muscle at its limit":
-        '<muscle joint="{0}" lengthrange="-2 2" force="30" forcerange="-1 0"/>',
-    "two, their sum at the joint's limit": '<velocity joint="{0}" kv="3"/>'
-        '<motor joint="{0}" gear="20"/>|actuatorfrcrange="-1 1"',
-    "two, one at its limit": '<position joint="{0}" kp="20" kv="1" forcerange="-1 1"/>'
-        '<velocity joint="{0}" kv="2"/>',
-    "gear": '<position joint="{0}" kp="20" kv="1" gear="3" forcerange="-9 9"/>',
-    "motor and damping": '<motor joint="{0}"/>|damping="2"',
-}  # fmt: skip
+}
 TWO_LINKS = (
     '<joint name="{0}"/><geom size=".1" pos="0 .2 0"/>'
     '<body pos="0 .4 0"><joint name="{0} a"/><geom size=".1" pos="0 .2 0"/></body>'
@@ -214,18 +197,14 @@ OTHERS = {
         '<joint joint="{0} a" coef="2"/></fixed>'),
 }  # fmt: skip
 #: What machine code plays, which takes minutes to compile with all.
-FEW = (
-    *("servo at its limit", "damper, more control than its range", "muscle"),
-    *("free, off its centre", "tendon at its limit"),
-)
+FEW = (*HINGES, "free, off its centre", "tendon at its limit")
 
 
 def compiled(chosen):
     """Returns a model of cases beside each other, and the case of each degree of freedom."""
-    hinge = '<joint name="{0}" axis="0 1 0" {1}/><geom size=".05" pos=".3 0 0"/>'
-    parts = {name: text.partition("|") for name, text in HINGES.items()}
-    cases = {name: (hinge.format(name, joint), act, "") for name, (act, _, joint) in parts.items()}
-    cases = {name: (cases | OTHERS)[name] for name in chosen}
+    hinge = '<joint name="{0}" axis="0 1 0"/><geom size=".05" pos=".3 0 0"/>'
+    cases = {name: (hinge, act, "") for name, act in HINGES.items()} | OTHERS
+    cases = {name: cases[name] for name in chosen}
     parts = [[part.format(name) for part in case] for name, case in cases.items()]
     bodies, actuators, tendons = ("".join(part) for part in zip(*parts, strict=True))
     bodies = "".join(f'<body pos="0 {i} 0">{part[0]}</body>' for i, part in enumerate(parts))

@@ -37,20 +37,14 @@ def test_what_can_be_played_passes(env):
     ("parts", "message"),
     [
         ({"max_episode_steps": 0}, "max_episode_steps must be a whole number, 1 or more, got 0"),
-        ({"max_episode_steps": True}, "max_episode_steps must be a whole number"),
         ({"reward_threshold": "high"}, "reward_threshold must be a number or None"),
-        ({"reward_threshold": np.nan}, "reward_threshold must be a number or None"),
         ({"action_size": 0}, "action_size must be a whole number"),
         ({"action_space": Discrete(3)}, "action_size is 1, but its action_space has 3 actions"),
         ({"action_space": Box(np.zeros(1), np.zeros(1))}, "must have low < high"),
-        ({"action_space": Box(np.zeros(2), np.ones(2))}, "of 1 entries each"),
         ({"action_space": (-1, 1)}, r"action_space is a builtins.tuple; make it a mjx_reinforce"),
         ({"reset": lambda s: s.replace(obs=None)}, "whose obs is a vector .* there is no obs"),
-        ({"reset": lambda s: s.replace(obs=1.0)}, "must be a vector .* its shape is ..; conc"),
         ({"reset": lambda s: s.replace(obs=jnp.ones((1, 2)))}, "its shape is .1, 2.; concatenate"),
-        ({"reset": lambda s: s.replace(obs=jnp.ones(0))}, "must be a vector"),
         ({"reset": lambda s: s.replace(done=jnp.ones(2))}, "the done of .* reduce it"),
-        ({"reset": lambda s: s.replace(obs=1j * s.obs)}, "must hold real numbers"),
         ({"step": lambda s: s.replace(info=jnp.ones(1))}, "info only after step"),
         ({"step": lambda s: s.replace(obs=jnp.ones(2))}, r"obs is float32\[1\] .* float32\[2\]"),
         ({"step": lambda s: s.replace(obs=s.obs if s.reward > 0 else -s.obs)}, "write jnp.where"),
@@ -68,16 +62,11 @@ def test_a_wider_state_may_be_kept_in_place_of_a_narrower_one_only():
         check_environment(toy(reset=lambda s: s.replace(reward=s.reward.astype(jnp.float16))))
 
 
-def test_a_policy_of_the_environment_passes():
-    check_policy(tabular_policy(), Chain(), 3, likelihood=True)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"init": lambda key: 1 / 0}, r"policy.init\(key\) fails"),
         ({"apply": lambda params, x: (x @ params)[:, :1]}, r"must return \[2, 2\].*got \[2, 1\]"),
-        ({"apply": lambda params, x: 3}, r"got \[\]"),
         ({"apply": lambda params, x: (x @ params).astype(int)}, "floating-point numbers, got int"),
         ({"distribution": 3}, "policy.distribution must be"),
     ],
@@ -107,17 +96,12 @@ def estimator(update):
     return Estimator(lambda key, observation_size: (), update, min_episodes=2)
 
 
-def test_an_estimator_whose_weights_fit_passes():
-    check_estimator(m.leave_one_out(0.9), Chain(), 3, 4)
-
-
 @pytest.mark.parametrize(
     ("update", "message"),
     [
         (lambda state, t: 1 / 0, "estimator.init or update fails"),
         (lambda state, t: (t.reward, state), "must return three things"),
         (lambda state, t: (t.reward[0], state, {}), r"here \[5, 4\]; got float32\[4\]"),
-        (lambda state, t: (t.mask, state, {}), r"got bool\[5, 4\]"),
         (lambda state, t: (t.reward, state, ()), "metrics as a dict, got tuple"),
     ],
 )
@@ -141,11 +125,6 @@ def test_what_is_no_update_is_named():
 
 # -------------------------------------------------------------------------------------------------
 # Checks of numbers and keys: what is no number is refused, what is traced is taken on trust.
-
-
-@pytest.mark.parametrize("value", [2, 2.0, np.float32(2), jnp.float32(2), np.int64(2)])
-def test_a_number_is_known(value):
-    assert checks.known_number(value) == 2.0
 
 
 @pytest.mark.parametrize("value", [True, "2", None, [1, 2], math.nan, np.ones(2)])
@@ -173,21 +152,3 @@ def test_the_range_of_a_number():
         checks.check_number("step", -1, finite=False)
     with pytest.raises(ValueError, match="finite, got inf"):
         checks.check_number("step", math.inf)
-
-
-def test_counts():
-    checks.check_count("N", 1)
-    checks.check_count("N", 0, least=0)
-    for value in (1.0, True, "1"):
-        with pytest.raises(ValueError, match="N"):
-            checks.check_count("N", value)
-    with pytest.raises(ValueError, match="N must be at least 2, got 1"):
-        checks.check_count("N", 1, least=2)
-
-
-def test_keys():
-    checks.check_key(jax.random.key(0))
-    checks.check_key(jax.random.PRNGKey(0))
-    for value in (0, jnp.zeros(2), None):
-        with pytest.raises(ValueError, match="must be a random key"):
-            checks.check_key(value)

@@ -1,7 +1,6 @@
 """The native engine plays the same episodes as `rollouts.rollout`, in machine code."""
 
 import functools
-import itertools
 import re
 
 import jax
@@ -11,14 +10,13 @@ import numpy as np
 import pytest
 from players import actor_and_act, assert_same_episodes, both, only_active, played
 from scenes import SCENE
-from toys import Bytes, Drifting
+from toys import Drifting
 
 from mjx_reinforce import Box
 from mjx_reinforce.engine.base import Discrete
-from mjx_reinforce.engine.cpu import kernel, machine
+from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.play import available, choice, native, objects, program, rollouts
-from mjx_reinforce.engine.scalar import scalarized
 from mjx_reinforce.registry import DISTRIBUTIONS, load_definition
 
 if reason := available.unavailable():
@@ -132,20 +130,6 @@ def test_a_nan_stays_in_its_lane():
         np.testing.assert_array_equal(one, other)
 
 
-def test_vectors_begin_at_multiples_of_their_size():
-    """As LLVM takes for granted, also of 16 numbers of 8 bytes."""
-    kinds = np.float32, np.float64, np.int32, np.int64
-    leaves = [jax.ShapeDtypeStruct((3,), x) for x in (*kinds, *kinds)]
-    for count in (1, 4, 8, 16):
-        places = kernel.layout(leaves, 1, count)
-        fields = [*places.inputs, places.broken, places.seed, places.episode]
-        for field, after in itertools.pairwise(fields):
-            assert after.offset >= field.offset + field.entries * field.dtype.itemsize * count
-        for field in fields:
-            vector = field.dtype.itemsize * count
-            assert field.offset % vector == kernel.ALIGNMENT % vector == 0
-
-
 @pytest.mark.cpu
 def test_double_precision():
     """Networks have float32 parameters, whatever jax_enable_x64 says."""
@@ -210,13 +194,6 @@ def test_auto_takes_it_and_says_what_it_cannot_play(monkeypatch):
     monkeypatch.setattr(available, "unavailable", lambda: "llvmlite is not installed")
     with pytest.raises(ValueError, match="llvmlite is not installed; choose auto"):
         chosen(Drifting(), "native")
-
-
-@pytest.mark.cpu
-def test_lanes_have_no_numbers_of_8_bits():
-    engine = chosen(Bytes())
-    assert engine.name == "vmap"
-    assert "machine code cannot play this: its state has numbers of int8" in engine.why
 
 
 def test_keys_of_another_generator():
@@ -291,20 +268,6 @@ def test_large_models_are_not_for_machine_code(monkeypatch):
 
 # -------------------------------------------------------------------------------------------------
 # The program of a CPU's threads: its text, and that an episode is the same in any lane.
-
-
-@pytest.mark.cpu
-def test_what_it_takes_it_frees_and_what_it_flushes_it_undoes():
-    env = Drifting()
-    actor, act, distribution = actor_and_act(env, ())
-    examples = program.step_shapes(env, actor)
-    function = program.step_function(env, act, distribution, 4)
-    varying = [True] * len(jax.tree.leaves(examples))
-    built = scalarized.build(function, examples, varying, program.BRANCH_COST, program.LOOPS)
-    work = kernel.kernel_text(built, len(jax.tree.leaves(actor)), 2).partition("@work(")[2]
-    assert work.count("call ptr @malloc") == work.count("call void @free") == 1
-    order = "call i64 @flush", "phi i64 [0, ", "call void @unflush", "call void @free"
-    assert sorted(order, key=work.index) == list(order)
 
 
 @pytest.mark.cpu

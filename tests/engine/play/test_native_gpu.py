@@ -123,27 +123,6 @@ def test_threads_meet_where_some_have_no_room_for_their_contacts(monkeypatch):
     assert block.apart is None
 
 
-def test_each_thread_has_words_of_its_own():
-    """Those of the threads of a warp are side by side."""
-    text = lockstep.ScratchText()
-    arrays = [text.reserve_long(np.int32, count) for count in (30, 40)]
-    block, lane = (
-        text.let(f"call i32 @llvm.nvvm.read.ptx.sreg.{x}()") for x in ("ctaid.x", "tid.x")
-    )
-    thread = text.let(f"add i32 {text.let(f'mul i32 {block}, 32')}, {lane}")
-    for array, count in zip(arrays, (30, 40), strict=True):
-        for k in range(count):
-            value = text.let(f"add i32 {text.let(f'mul i32 {thread}, 100')}, {k + count}")
-            text.store(value, text.at(array, np.int32, text.let(f"add i64 {k}, 0")), np.int32)
-    text.line("ret void")
-    code = gpu_on_cpu.compiled(text.function("ptx_kernel void @play(ptr %scratch) #0"))
-    buffer = np.zeros((2, 70, 32), np.int32)
-    gpu_on_cpu.run_threads(code.addresses["play"], 64, [buffer])
-    entries = np.concatenate([np.arange(30) + 30, np.arange(40) + 40])
-    threads = np.arange(64).reshape(2, 1, 32)
-    np.testing.assert_array_equal(buffer, 100 * threads + entries[:, None])
-
-
 def kernel_text(env, actor, act, distribution):
     examples = program.step_shapes(env, actor)[:-1]
     function = program.step_function(env, act, distribution, 50)
@@ -306,22 +285,6 @@ def test_the_same_steps_as_on_a_cpu(monkeypatch, env, threads):
         np.testing.assert_allclose(x, y, rtol=2e-5, atol=2e-5)
 
 
-def test_threads_of_a_block_meet(monkeypatch):
-    """In loops and branches that all of them go through together, also those that have no more."""
-    env = Busy(SPACE)
-    want = play(env, steps=12)
-    meetings = []
-    for long in (10**9, 0):
-        block = gpu_on_cpu.Block(3)
-        gpu_on_cpu.emulate(monkeypatch, block=block)
-        monkeypatch.setattr(lockstep, "LONG", long)
-        got = play(env, steps=12)
-        assert block.apart is None
-        meetings.append(block.meetings)
-        np.testing.assert_allclose(got.obs, want.obs, rtol=2e-5, atol=2e-5)
-    assert 12 < meetings[0] < meetings[1]
-
-
 def test_mapped_over_it_remains_one_launch(monkeypatch):
     gpu_on_cpu.emulate(monkeypatch, 2)
     vec = make_vec(TOY, 4, engine="native")
@@ -341,18 +304,3 @@ def test_machine_code_for_a_gpu_is_chosen_where_a_step_is_large(monkeypatch):
     assert "XLA's kernels are the fastest" in engine.why
     monkeypatch.setattr(choice, "_SMALL", 10)
     assert make_vec(TOY, 4).engine.name == "native"
-
-
-@pytest.mark.slow
-def test_llvm_makes_ptx_of_it(monkeypatch):
-    """For the real target, where this LLVM has it."""
-    kept = {}
-    monkeypatch.setattr(objects, "folder", lambda: None)
-    monkeypatch.setattr(available, "platform", lambda: "gpu")
-    monkeypatch.setattr(available.gpu, "kernels_unavailable", lambda: None)
-    monkeypatch.setattr(available.gpu, "compute_capability", lambda: "9.0")
-    compile_ptx = ptx._compile
-    monkeypatch.setattr(ptx, "_compile", lambda *x: kept.setdefault("text", compile_ptx(*x)))
-    make_vec("InvertedPendulum-v5", 4, engine="native")
-    assert ".visible .entry play(" in kept["text"]
-    assert ".maxntid" in kept["text"]

@@ -14,7 +14,6 @@ import native_items as items
 import numpy as np
 import pytest
 from jax import lax
-from native_items import N, T
 from places import PYTHONPATH
 
 from mjx_reinforce.engine.cpu import handler, machine, seam
@@ -334,22 +333,9 @@ def test_a_program_on_disk_finds_its_code(kept_code, monkeypatch):
     assert seam.targets() == [f"mjx_reinforce_{kept_code.key}"]
 
 
-def test_a_program_without_handlers_needs_none(kept_code, monkeypatch):
-    monkeypatch.setattr(objects, "folder", lambda: None)
-    assert seam.restore(b"a program")
-    assert not seam.restore(b"mjx_reinforce_" + b"0" * 64)
-
-
 def test_code_that_is_gone_is_not_restored(kept_code, tmp_path, monkeypatch):
     assert not seam.restore(b"mjx_reinforce_" + b"0" * 64)
     monkeypatch.setattr(machine, "_LOADED", {})
     for path in tmp_path.iterdir():
         path.unlink()
     assert not seam.restore(seam._target(kept_code.key).encode())
-
-
-def test_xla_is_told_once(kept_code, monkeypatch):
-    seam.register(kept_code)
-    monkeypatch.setattr(seam.jax.ffi, "register_ffi_target", pytest.fail)
-    seam.register(kept_code)
-    assert [x.shape for x in items.play(kept_code, [1, 1])][:2] == [(2, T, N, 2), (2, T, N, 1)]

@@ -3,7 +3,6 @@
 import pickle
 import subprocess
 import sys
-import threading
 
 import gymnasium
 import jax
@@ -145,18 +144,6 @@ def test_same_step_tells_the_terms_of_every_step():
         assert told["reward_survive"].tolist() == [1, 1]
 
 
-def test_wrappers_of_gymnasium_count_episodes():
-    env = gymnasium.wrappers.vector.RecordEpisodeStatistics(
-        gymnasium.make_vec(CART, num_envs=8, max_episode_steps=20)
-    )
-    env.reset(seed=0)
-    for _ in range(19):
-        env.step(np.zeros(8, int))
-    lengths = list(env.length_queue)
-    assert lengths
-    assert all(8 <= length <= 11 for length in lengths)
-
-
 @pytest.mark.parametrize(
     ("env_id", "actions", "message"),
     [
@@ -220,20 +207,6 @@ def test_closed_twice(cart):
     cart.close()
     with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="make another"):
         cart.step(np.zeros(3, int))
-
-
-def test_two_threads_with_an_environment_each():
-    found = {}
-
-    def run(name):
-        found[name] = play(gym.make("CartPole-v1", 2))
-
-    threads = [threading.Thread(target=run, args=(k,)) for k in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    np.testing.assert_array_equal(found[0], found[1])
 
 
 def test_jax_arrays_are_handed_out_as_they_are():

@@ -2,7 +2,6 @@
 
 import functools
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,9 +12,6 @@ from toys import Drifting
 
 from experiments.checks.vector_parity import GymnasiumSide, compare
 from mjx_reinforce import Box, Discrete, envs, make_vec
-from mjx_reinforce.engine import scalar
-from mjx_reinforce.engine.play.counter import key_of
-from mjx_reinforce.engine.play.program import machine_map
 from mjx_reinforce.engine.vector.environment import AUTORESETS
 from mjx_reinforce.engine.vector.for_brax import BraxVectorEnv
 
@@ -171,15 +167,11 @@ def test_what_begins_episodes_by_itself_is_refused(wrapper):
     [
         ({"num_envs": 0}, "num_envs must be at least 1, got 0"),
         ({"num_envs": 10**12}, "environments need .* make at most"),
-        ({"autoreset": "never"}, "autoreset"),
-        ({"engine": "fast"}, "engine"),
         ({"max_episode_steps": 0}, "max_episode_steps must be at least 1, got 0"),
         ({"reset_noise": 1}, "reset_noise.*[^']$"),
         ({"autorest": "same_step"}, "'autorest'.* Known: .*; make_vec itself takes 'autoreset'$"),
         ({"env": Drifting(SPACE), "engin": "vmap"}, "already; make_vec itself takes 'engine'$"),
-        ({"env": "CartPole-v9"}, "CartPole-v9"),
         ({"env": Drifting(SPACE), "reset_noise": 1}, "are for an id"),
-        ({"env": object()}, "reset"),
     ],
 )
 def test_bad_arguments(arguments, message):
@@ -220,47 +212,10 @@ def test_bad_keys_actions_and_states():
             jax.jit(vec.step)(wrong, jnp.zeros((4, 1)))
 
 
-def test_gymnasiums_own_names_of_autoreset():
-    mode = gymnasium.vector.AutoresetMode.SAME_STEP
-    assert make_vec("CartPole-v1", 1, autoreset=mode).autoreset == "same_step"
-
-
 @pytest.mark.cpu
 def test_why_an_engine_was_chosen():
     assert make_vec("CartPole-v1", 2).engine.why == "machine code for this CPU"
     assert make_vec("CartPole-v1", 2, engine="vmap").engine.why == "chosen by name"
-
-
-def test_what_cannot_be_machine_code_is_played_by_vmap():
-    class Sorting(Drifting):
-        def step(self, state, action):
-            state = super().step(state, action)
-            return state.replace(obs=jnp.fft.fft(state.obs).real)
-
-    vec = make_vec(Sorting(SPACE), 3)
-    assert vec.engine.name == "vmap"
-    assert "fft" in vec.engine.why
-    with pytest.raises(ValueError, match=r"the native engine cannot play this: .*fft"):
-        make_vec(Sorting(SPACE), 3, engine="native")
-
-
-@pytest.mark.slow
-def test_keys_are_drawn_from_as_jax_does():
-    """Split, folded, chosen and moved, in scalars and in machine code."""
-
-    def draw(words, wrap):
-        first, second = jax.random.split(wrap(words))
-        chosen = jax.random.fold_in(jnp.where(words[0] > np.uint32(2**31), first, second), 7)
-        several = jax.random.split(chosen, (2, 2))
-        keys = (first, chosen, several[1, 0], several.reshape(4)[3])
-        return [jax.random.normal(key, (3,)) for key in keys]
-
-    words = np.random.default_rng(0).integers(0, 2**32, (9, 2), dtype=np.uint32)
-    want = jax.vmap(functools.partial(draw, wrap=jax.random.wrap_key_data))(words)
-    written = functools.partial(draw, wrap=key_of)
-    got = machine_map(written, jax.ShapeDtypeStruct((2,), jnp.uint32))(jnp.asarray(words))
-    assert_close(got, want, 2e-6)
-    assert_close(jax.jit(scalar.vmap(written))(words), want, 2e-6)
 
 
 @pytest.mark.slow
