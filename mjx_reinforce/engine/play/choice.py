@@ -178,7 +178,8 @@ def map_function(
     Raises:
       ValueError: the name is unknown, or the engine does not support the function.
     """
-    made = _in_scalars(function, *examples) if name == "auto" else None
+    by_xla = name == "auto" and available.platform() == "gpu" and team.why_not(env) is not None
+    made = _in_scalars(function, *examples) if by_xla else None
     in_machine_code = functools.partial(machine_code, env, function, *examples)
     return MapEngine(*(made or pick(name, in_machine_code, jax.vmap(function))))
 
@@ -187,10 +188,7 @@ def _in_scalars(
     function: Callable[..., Any], *examples: PyTree
 ) -> tuple[str, str, Callable[..., Any]] | None:
     """Returns a function that is small enough for XLA's kernels on a GPU, written out for them."""
-    if (
-        available.platform() != "gpu"
-        or size.num_scalars(jaxprs.trace(function, *examples)[0]) >= _SMALL
-    ):
+    if size.num_scalars(jaxprs.trace(function, *examples)[0]) >= _SMALL:
         return None
     # On a GPU a real branch makes the host wait for its predicate: both sides are computed.
     mapped = scalar.vmap(function, branch_cost=MAX_OPERATIONS)

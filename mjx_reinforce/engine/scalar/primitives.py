@@ -12,7 +12,7 @@ lane does not need it.
 
 import functools
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -207,14 +207,12 @@ def whole(
     return dict(zip(results, made, strict=True))
 
 
-def owners(traced: jaxprs.Program) -> list[Any]:
-    """Returns, each once, whose operations a program calls by their names."""
-    found: list[Any] = []
+def owners(traced: jaxprs.Program) -> Iterator[Any]:
+    """Yields, once a call, whose operations a program calls by their names."""
     for eqn in traced.jaxpr.eqns:
-        inner = map(owners, jaxprs.subprograms(eqn.params.values()))
-        of = [eqn.params["owner"]] if eqn.primitive is _WHOLE else itertools.chain(*inner)
-        found += [x for x in of if x is not None and all(x is not y for y in found)]
-    return found
+        if eqn.primitive is _WHOLE and eqn.params["owner"] is not None:
+            yield eqn.params["owner"]
+        yield from itertools.chain(*map(owners, jaxprs.subprograms(eqn.params.values())))
 
 
 @jax.custom_batching.custom_vmap

@@ -1,11 +1,12 @@
 """Kernels for teams of lanes, compiled with one lane for this CPU, beside its machine code."""
 
 import gpu_on_cpu
+import jax
 import numpy as np
 import pytest
 from players import actor_and_act, only_active, played
 
-from mjx_reinforce import envs
+from mjx_reinforce import envs, make_vec
 from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.play import available, native
 from mjx_reinforce.engine.team import nvrtc
@@ -62,3 +63,21 @@ def test_teams_play_only_active_episodes(teams):
     some = only_active(native.rollout, env, player, chosen, horizon=20)
     assert some.mask.any(1).tolist() == chosen.tolist()
     assert {kernel.lanes for kernel in made} == {16}
+
+
+@pytest.mark.slow
+def test_teams_step_environments_side_by_side(teams):
+    """Those whose episode is over begin another, in the same kernel."""
+
+    def stepped(engine):
+        vec = make_vec("Hopper-v5", 3, engine=engine, max_episode_steps=2)
+        state = vec.reset(jax.random.key(0))
+        for action in np.linspace(-1, 1, 36, dtype=np.float32).reshape(4, 3, 3):
+            state = vec.step(state, action)
+        return state
+
+    want, made = stepped("native"), teams()
+    got = stepped("native")
+    assert {kernel.lanes for kernel in made} == {16}
+    np.testing.assert_allclose(got.obs, want.obs, rtol=2e-3, atol=2e-3)
+    assert got.episode_length.tolist() == want.episode_length.tolist() == [1, 1, 1]
