@@ -1,4 +1,4 @@
-"""Writes the tables of speed of README.md and docs/benchmarks.md from docs/benchmarks.csv.
+"""Writes what README.md and docs/benchmarks.md say of speed from docs/benchmarks.csv.
 
 ``python -m experiments.speed.benchmark.tables`` replaces what stands between ``<!-- NAME -->`` and
 ``<!-- end -->``, where NAME is one of `TABLES`. A number is the median of a row's repetitions, the
@@ -15,7 +15,7 @@ from experiments.kit.places import DOCS, ROOT
 from experiments.speed.benchmark.rows import RAW, read, speed
 
 PAGES = (ROOT / "README.md", DOCS / "benchmarks.md")
-#: The tasks of README.md's table.
+#: The tasks that are compared in words.
 FEW = ("InvertedPendulum-v5", "Reacher-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5")
 OTHERS = (
     *("InvertedDoublePendulum-v5", "Swimmer-v5", "Pusher-v5", "Humanoid-v5"),
@@ -125,20 +125,22 @@ def span(name: str, pairs: list[tuple[str, Any, Any]]) -> str:
 
 
 def readme(raw: Raw) -> str:
-    """The table of README.md."""
-    rows = []
-    for task in FEW:
-        cpu = (best(raw.cpu, task, "native", "float32"), best(raw.cpu, task, "C MuJoCo"))
-        gpu = (best(raw.gpu, task, engine) for engine in ("native", "MuJoCo Warp"))
-        rows.append((task, *map(rate, (*gpu, *cpu))))
-    card = listed(dict.fromkeys(r["device"] for r in raw.gpu if r["device"] != "cpu"))
-    header = ("task", f"one {card}", "MuJoCo Warp on it", "two CPU cores", "C MuJoCo on them")
-    return table(header, rows)
+    """The line of README.md."""
+    task = "HalfCheetah-v5"
+    on_gpu, warp = (best(raw.gpu, task, engine) for engine in ("native", "MuJoCo Warp"))
+    on_cpu, c_mujoco = best(raw.cpu, task, "native", "float32"), best(raw.cpu, task, "C MuJoCo")
+    return textwrap.fill(
+        f"HalfCheetah plays {rate(on_gpu)} env steps per second on one H100, "
+        f"{ratio(on_gpu, warp)} times as many as in MuJoCo Warp, and {rate(on_cpu)} on two CPU "
+        f"cores, {ratio(on_cpu, c_mujoco)} times as many as in C MuJoCo, which computes in float64.",
+        110,
+    )
 
 
 def words(raw: Raw) -> str:
     """How many times as fast as others, in a sentence."""
     warp, equal, single = [], [], []
+    names = listed([task.partition("-v")[0] for task in FEW])
     for task in FEW:
         gpu, other = best(raw.gpu, task, "native"), best(raw.gpu, task, "MuJoCo Warp")
         cpu, double = (best(raw.cpu, task, "native", x) for x in ("float32", "float64"))
@@ -147,7 +149,7 @@ def words(raw: Raw) -> str:
         single.append((task, cpu, c_mujoco))
         equal.append((task, double, c_mujoco))
     return textwrap.fill(
-        "On two cores `native` plays the tasks of README.md at "
+        f"On two cores `native` plays {names} at "
         f"{span('the speed of C MuJoCo', equal)} in equal precision, and at "
         f"{span('its speed', single)} in float32, which is what it trains in; on the GPU at "
         f"{span('the speed of MuJoCo Warp', warp)}.",

@@ -19,7 +19,7 @@ from mjx_reinforce.statistics.aggregates import interval
 WITHIN = (50_000, 100_000)
 PEERS = ("Stable-Baselines3 PPO", "Stable-Baselines3 SAC")
 #: The tasks of README.md.
-_README = ("Hopper-v5", "HalfCheetah-v5", "Walker2d-v5", "Ant-v5", "Humanoid-v5", "Swimmer-v5")
+_README = ("Hopper-v5", "HalfCheetah-v5", "Ant-v5", "Humanoid-v5")
 
 
 def number(x: float) -> str:
