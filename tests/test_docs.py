@@ -158,13 +158,6 @@ def test_thresholds_are_those_of_the_tasks():
         assert (threshold, horizon) == (known, f"{env.max_episode_steps:,}")
 
 
-def test_the_site_says_how_to_cite():
-    said = (ROOT / "CITATION.cff").read_text("utf-8")
-    for entry in (r'^title: "(.+)"', "^  - name: (.+)"):
-        value = re.search(entry, said, re.M)[1].replace("_", r"\_")
-        assert f"{{{{{value}}}}}" in page("index.md")
-
-
 def test_pages_name_experiments_that_exist():
     pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")]
     for path in [*pages, *(ROOT / "experiments").rglob("*.py"), ROOT / "experiments/README.md"]:

@@ -103,11 +103,9 @@ class Machine:
         self.env_steps, self.updates, self.budget = 0, 0, None
 
     def states(self):
-        def both(x):
-            return np.stack([np.asarray(counts.from_int(x))] * 2)
-
-        states = SimpleNamespace(env_steps=both(self.env_steps), num_updates=both(self.updates))
-        return SimpleNamespace(train_states=states)
+        made = {"env_steps": self.env_steps, "num_updates": self.updates}
+        each = {name: np.stack([counts.from_int(x)] * 2) for name, x in made.items()}
+        return SimpleNamespace(train_states=SimpleNamespace(**each))
 
     def advance(self, look):
         assert not look
