@@ -4,7 +4,7 @@ import pytest
 
 from experiments.kit.rows import threads
 from experiments.speed.benchmark import rows, tables
-from experiments.speed.benchmark.peers import c_mujoco, warp_room
+from experiments.speed.benchmark.peers import c_mujoco
 
 ROW = {
     "date": "2026-11-24T12:00:00",
@@ -53,28 +53,8 @@ def test_c_mujoco_stands_beside_its_own_precision_of_the_same_call():
     assert "4.0 (Hopper) to 4.0 (Hopper) times the speed of C MuJoCo in equal precision" in sentence
 
 
-def test_a_trained_policy_counts_where_there_is_no_other():
-    later = {"date": "2026-11-25T12:00:00", "what": "rollout, trained 32-32 policy"}
-    other = GPU | later | {"task": "Humanoid-v5"}
-    assert tables.last_calls([GPU | later, GPU, other]).gpu == [GPU, other]
-
-
-def test_training_beside_rollouts_of_one_second_is_kept_apart():
-    training = GPU | {"what": "training, untrained 64-64 policy"}
-    raw = tables.last_calls([GPU, training])
-    assert (raw.gpu, raw.train) == ([GPU], [training])
-
-
 def test_peers_say_their_precision_and_settings():
     candidate = c_mujoco("InvertedPendulum-v5", batch=2, steps=1)
     candidate.run()
     assert (candidate.env_steps, candidate.row["precision"]) == (2, "float64")
     assert f"{threads()} threads; NEWTON, 100 iterations" in candidate.row["settings"]
-
-
-def test_mujoco_warp_has_room_by_the_model():
-    pendulum, hopper = (
-        warp_room(task, worlds=4, steps=30) for task in ("InvertedPendulum-v5", "Hopper-v5")
-    )
-    assert pendulum == {"nconmax": 8, "njmax": 8}  # no contacts; two limits at most
-    assert pendulum["njmax"] < hopper["njmax"] < 256

@@ -5,10 +5,9 @@ import math
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from experiments.studies.results import __main__ as results
-from experiments.studies.results import films, kept, runs, tables
+from experiments.studies.results import kept, runs, tables
 from experiments.studies.results.tasks import TASKS, settings_of
 from mjx_reinforce.files import write_json
 from mjx_reinforce.runs import command_line
@@ -37,13 +36,6 @@ def test_verdict_asks_whether_the_intervals_overlap(low, high, published, expect
     assert tables.verdict(Estimate(1000.0, *none), (900.0, 1.0)) == "no interval"
     assert tables.verdict(Estimate(1000.0, *none), (1000.0, 0.0)) == "not apart"
     assert tables.verdict(Estimate((low + high) / 2, low, high), published) == expected
-
-
-def test_compare_tells_simulations_apart():
-    assert tables.compare([1000.0] * 5, [1000.0] * 5)[2] == (0, 0, 0)
-    rng = np.random.default_rng(0)
-    difference = tables.compare(rng.normal(0, 1, 100), rng.normal(1, 1, 100))[2]
-    assert 0 < difference.low < 1 < difference.high
 
 
 def test_the_tasks_have_settings_that_hold(tmp_path):
@@ -158,18 +150,3 @@ def test_the_tables_of_both_pages(folder):
     assert (docs / "results" / "seconds.png").exists()
     for text in (page, readme):
         assert "was here" not in text
-
-
-def test_a_film_of_the_pages_has_as_many_colours_as_its_size_allows(tmp_path):
-    still = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
-    frames = [np.roll(still, 8 * i, axis=1) for i in range(6)]
-    sizes = []
-    for most in (10**6, 40_000, 20_000):
-        films.write_small_gif(tmp_path / "film.gif", frames, 10.0, most)
-        sizes.append((tmp_path / "film.gif").stat().st_size)
-        assert sizes[-1] <= most
-        with Image.open(tmp_path / "film.gif") as film:
-            assert film.n_frames == 6
-    assert sizes[0] > sizes[-1]
-    with pytest.raises(ValueError, match="make it shorter or smaller"):
-        films.write_small_gif(tmp_path / "film.gif", frames, 10.0, 100)

@@ -15,8 +15,6 @@ from mjx_reinforce.envs import models
 from mjx_reinforce.export import films
 from mjx_reinforce.export.run_files import FOLDER
 
-ASSETS = sorted(path.name for path in (FOLDER.parents[2] / "envs" / "assets").glob("*.xml"))
-
 
 def pictures(path):
     with Image.open(path) as film:
@@ -152,32 +150,6 @@ def test_takes_stand_side_by_side(monkeypatch):
     assert set(film.samples) >= {0, 3}
     with pytest.raises(ValueError, match="at least one take"):
         films.side_by_side([], 40, 30, seconds=1.0)
-
-
-def test_return_and_time_stand_in_the_picture(monkeypatch):
-    said = []
-    monkeypatch.setattr(films, "caption", lambda picture, *words: said.append(words) or picture)
-    monkeypatch.setattr(films, "Renderer", lambda *_: type("", (), {"draw": lambda *_: None})())
-    take = films.Take("mine", None, 0.5, np.zeros((5, 1)), np.array([1.0, 2.0, 400.0, 1000.0]))
-    for step in range(5):
-        films._picture(take, films.Renderer(), 0.5 * step)
-    assert said[0] == ("mine", "return 0.0    0.0 s")
-    assert said[3:] == [("mine", "return 403    1.5 s"), ("mine", "return 1,403    2.0 s")]
-
-
-def test_a_gif_is_whole(tmp_path):
-    rng = np.random.default_rng(0)
-    still = rng.integers(0, 256, (40, 60, 3), np.uint8)
-    frames = [still.copy() for _ in range(6)]
-    for i, frame in enumerate(frames):
-        frame[:8, 8 * i : 8 * i + 8] = 255 * (i % 2)
-    path = tmp_path / "film.gif"
-    path.write_bytes(films.gif(iter(frames), 10.0, frames[:2]))
-    shown = [*pictures(path)]
-    assert len(shown) == 6
-    for got, frame in zip(shown, frames, strict=True):  # what is transparent is what was there
-        assert np.abs(got - frame).mean() < 25
-        assert np.abs(got - frame)[:8, :48].max() < 120
 
 
 @pytest.mark.slow

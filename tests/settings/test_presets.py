@@ -130,10 +130,3 @@ def test_defaults_that_a_policy_does_not_read_are_not_the_users(id, words):
         changed = dataclasses.replace(config, initial_std=1.0)
         with pytest.raises(ValueError, match=r"--initial-std 1\.0 would do nothing"):
             check_read_by_policy(changed, default, family)
-
-
-def test_a_table_has_the_settings_of_those_that_it_is_like():
-    first, second = (PRESETS[f"gymnasium-tutorial{version}"][1] for version in ("", "-v0.26"))
-    assert second == dataclasses.replace(first, algorithm="gymnasium-tutorial-v0.26")
-    assert (first.hidden_sizes, first.decay_steps) == ((16, 32), None)
-    assert "plain" not in PRESETS  # a part of others

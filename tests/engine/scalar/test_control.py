@@ -10,11 +10,10 @@ from jax import lax
 from mapped import assert_same, batch_of, collatz, count, heavy, line_search, primitives
 
 from mjx_reinforce.engine import scalar
-from mjx_reinforce.engine.scalar import jaxprs, scalarize, scalarized, size
+from mjx_reinforce.engine.scalar import jaxprs, scalarized, size
 from mjx_reinforce.engine.scalar.graph import Limits
 from mjx_reinforce.engine.scalar.nodes import Node
 from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop
-from mjx_reinforce.engine.scalar.rules import iterate
 
 LOOPS = [
     lambda x: lax.fori_loop(0, 20, lambda i, y: 0.9 * y + i, x),
@@ -199,35 +198,6 @@ def test_a_gate_computes_what_its_results_need():
     assert names(gate.body) == ["cos", "sin", "select_n"]
 
 
-@pytest.mark.parametrize("outer", ["scan", "while"])
-def test_a_body_with_a_loop_is_written_once(outer, monkeypatch):
-    """And what all lanes share stays shared."""
-    written = []
-    original = iterate._trace_body
-
-    def count(graph, plan, fixed, varying):
-        written.append(plan)
-        return original(graph, plan, fixed, varying)
-
-    monkeypatch.setattr(iterate, "_trace_body", count)
-
-    def body(state):
-        number, x = state
-        return number + 1, lax.fori_loop(0, 50, lambda _, y: y * 0.5 + number, x) + x
-
-    def function(x):
-        start = jnp.int32(0), x
-        if outer == "scan":
-            return lax.scan(lambda state, _: (body(state), None), start, length=40)[0]
-        return lax.while_loop(lambda state: state[0] < 40, body, start)
-
-    ((number,), (x,)) = scalarize(function, jnp.float32(3)).outputs
-    loop = x.owner
-    assert [loop.outs[-2], loop.outs[-1]] == [number, x]
-    assert [number.varying, x.varying] == [False, True]
-    assert sum(plan.inits == loop.inits for plan in written) == 1
-
-
 # -------------------------------------------------------------------------------------------------
 # What a function says to be written out as: the choice by engine, and what may be skipped.
 
@@ -410,24 +380,6 @@ def test_where_it_is_known_whether_it_is_needed():
     for needed in (True, False):
         both = scalar.vmap(lambda x, n=needed: scalar.skippable(jnp.array(n), lambda: x * 2, x))
         np.testing.assert_array_equal(both(jnp.ones(3)), [1.0 + needed] * 3)
-
-
-def test_nothing_is_selected():
-    """Of ``lax.cond`` each lane's own result is."""
-
-    def sines(x):
-        return sum(jnp.sin(x * k) for k in range(1, 9))
-
-    def skipping(x):
-        return scalar.skippable(x != 0, lambda: sines(x), jnp.zeros(()))
-
-    def choosing(x):
-        return jax.lax.cond(x != 0, lambda: sines(x), lambda: jnp.zeros(()))
-
-    written = [scalar.scalarize(f, jnp.ones(()), branch_cost=3) for f in (skipping, choosing)]
-    assert [x.operations["select_n"] for x in written] == [0, 1]
-    results = [jax.jit(scalar.vmap(f, branch_cost=3))(NUMBERS) for f in (skipping, choosing)]
-    np.testing.assert_array_equal(*results)
 
 
 def test_results_must_be_of_the_structure_of_what_is_skipped_to():
