@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_reinforce.engine.gpu import lockstep
-from mjx_reinforce.engine.gpu.lockstep import Lockstep, ScratchText, operations, some_of_block
+from mjx_reinforce.engine.gpu.lockstep import Lockstep, operations, some_of_block
 from mjx_reinforce.engine.llvm.emit import Input
+from mjx_reinforce.engine.llvm.text import Text
 from mjx_reinforce.engine.play.episode import NOT_PLAYED
 from mjx_reinforce.engine.scalar import scalarized
 from mjx_reinforce.engine.scalar.jaxprs import num_entries
@@ -38,9 +39,8 @@ _ATTRIBUTES = """attributes #0 = {{ "denormal-fp-math-f32"="preserve-sign"
 """
 
 
-def entry_text(text: ScratchText, parameters: Sequence[str], written: scalarized.Scalarized) -> str:
+def entry_text(text: Text, parameters: Sequence[str], written: scalarized.Scalarized) -> str:
     """Returns the kernel of a body, with the bounds of its threads."""
-    parameters = [*parameters, *(["ptr noalias %scratch"] if text.words else [])]
     blocks = _LONG_BLOCKS if operations(written.schedule) > lockstep.LONG else _SHORT_BLOCKS
     kernel = text.function(f"ptx_kernel void @{ENTRY}({', '.join(parameters)}) #0")
     return kernel + _ATTRIBUTES.format(*blocks) + lockstep.LOOP_FACTS
@@ -62,9 +62,9 @@ def kernel_text(step: scalarized.Scalarized, num_actor: int) -> str:
     and of the state [S, N, ...] that are not empty; as many again as there are results, which it
     does not read; and the results, which are zero when it starts: observation [S, T, O, N], action
     [S, T, A, N], reward [S, T, N], length [S, N] int32, broken [S, N] int32, simulated [S] int32
-    and next [1] int32, the item to be fetched next; and, if there are long arrays, the buffer of
-    ``ScratchText``. Item k is episode k % N of seed k / N. A thread counts the steps that
-    it waits for others in its block as simulated for the seed it played last, if there is one.
+    and next [1] int32, the item to be fetched next. Item k is episode k % N of seed k / N. A thread
+    counts the steps that it waits for others in its block as simulated for the seed it played last,
+    if there is one.
 
     Args:
       step: of ``program.step_function`` where an episode is running, written out.
@@ -77,7 +77,7 @@ class _Kernel:
     """Writes ``@play``."""
 
     def __init__(self, step: scalarized.Scalarized, num_actor: int):
-        self.text, self.step = ScratchText(), step
+        self.text, self.step = Text(1), step
         avals = [(np.dtype(x.dtype), num_entries(x)) for x in step.in_avals]
         actor, own = avals[:num_actor], avals[num_actor:]
         state = own[: len(own) - _NUM_OTHERS]
@@ -259,21 +259,22 @@ def mapping_text(written: scalarized.Scalarized) -> str:
 
     Its arguments are pointers to: sizes [2] int32 (examples N, threads in all), the leaves [N, ...]
     of the function's arguments that are not empty; as many again as there are results, which it
-    does not read; and the results, the leaves of the function's result that are not empty; and, if
-    there are long arrays, the buffer of ``ScratchText``. Thread k computes the examples k,
-    k + threads and so on.
+    does not read; and the results, the leaves of the function's result that are not empty. Thread k
+    computes the examples k, k + threads and so on.
 
     Args:
       written: the function.
     """
-    text = ScratchText()
+    text = Text(1)
     given = [k for k, leaf in enumerate(written.in_avals) if num_entries(leaf)]
     made = [k for k, leaf in enumerate(written.out_avals) if num_entries(leaf)]
     own = [
         text.reserve(x.dtype, num_entries(x)) if num_entries(x) else "null"
         for x in written.in_avals
     ]
-    in_block, block, threads = (text.let(text.asked(x)) for x in ("tid", "ctaid", "ntid"))
+    asked = [f"i32 @llvm.nvvm.read.ptx.sreg.{x}.x()" for x in ("tid", "ctaid", "ntid")]
+    text.declared |= {f"declare {x}" for x in asked}
+    in_block, block, threads = (text.let(f"call {x}") for x in asked)
     number = text.let(f"add i32 {text.let(f'mul i32 {block}, {threads}')}, {in_block}")
     total, stride = (text.load(text.at("%sizes", _INT, k), _INT) for k in range(2))
     before, head, body, end = text.block, text.label(), text.label(), text.label()

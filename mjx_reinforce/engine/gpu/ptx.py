@@ -27,8 +27,8 @@ from mjx_reinforce.engine.team import nvrtc
 
 #: LLVM's name of NVIDIA's GPUs.
 TRIPLE = "nvptx64-nvidia-cuda"
-#: What finds a kernel's threads and blocks, and, where it has any, its scratch.
-_BOUNDS, _SCRATCH = (r"\.maxntid (\d+)", r"\.minnctapersm (\d+)"), r"\bscratch = (\d+)"
+#: What finds a kernel's threads and blocks.
+_BOUNDS = r"\.maxntid (\d+)", r"\.minnctapersm (\d+)"
 #: What GPUs of compute capability 7.0 need. For one that it does not know, LLVM writes 3.2.
 _VERSION, _LEAST_VERSION = r"\.version (\d+\.\d+)", 6.0
 #: The first line of CUDA C++: lanes of a team, threads and shared memory of a block, scratch.
@@ -110,8 +110,7 @@ def described(key: str, text: str, *, compiled: bool) -> Kernel:
         lanes, threads, shared, words = map(int, found.groups())
         return Kernel(key, text, threads, 1, words, compiled, lanes, shared)
     threads, blocks = (int(re.findall(x, text)[0]) for x in _BOUNDS)
-    scratch = int((re.findall(_SCRATCH, text) or [0])[0])
-    return Kernel(key, text, threads, blocks, scratch, compiled)
+    return Kernel(key, text, threads, blocks, 0, compiled)
 
 
 def _compile(text: str, capability: str) -> str:

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.engine.gpu import ptx
-from mjx_reinforce.engine.gpu.lockstep import WARP
 from mjx_reinforce.engine.play import objects
 from mjx_reinforce.engine.team import kernel as team
 from mjx_reinforce.engine.team import nvrtc
@@ -25,6 +24,8 @@ from mjx_reinforce.engine.team import nvrtc
 _OLDEST = (22,)
 #: What may assemble a kernel, what is preferred first.
 Assemblers = tuple[ptx.Assembler, ...]
+#: Threads of a warp.
+_WARP = 32
 #: XLA's names of the handlers that it knows.
 _HANDLERS: set[str] = set()
 _LOCK = threading.Lock()
@@ -236,6 +237,6 @@ def _grid(items: int, most: int, blocks: int) -> tuple[int, int]:
     They are spread over all multiprocessors, each of which has so many blocks at most.
     """
     processors = jax.devices()[0].core_count
-    warps = -(-items // (WARP * processors))
-    threads = min(WARP * warps, most)
+    warps = -(-items // (_WARP * processors))
+    threads = min(_WARP * warps, most)
     return min(-(-items // threads), blocks * processors), threads

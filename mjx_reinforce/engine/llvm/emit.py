@@ -119,10 +119,6 @@ class LLVM(Backend[Value]):
         self._left = before
         return inner
 
-    def reserve(self, dtype: np.dtype, count: int) -> str:
-        """Returns a pointer to room for an array that a loop reads or leaves."""
-        return self._text.reserve(dtype, count)
-
     def some(self, mask: str) -> str:
         """Returns an i1: whether some lane of a mask is set, for a gate or a loop."""
         return self._text.any(mask)
@@ -160,7 +156,7 @@ class LLVM(Backend[Value]):
         carries = [carry for carry in loop.carries if carry.leaf not in idle]
         inits = [self.value(carry.init, values) for carry in carries]
         readers = [self._reader(e.leaf, e.values, values) for e in loop.elements]
-        kept = [self.reserve(r.value.dtype, loop.length or 0) for r in loop.records]
+        kept = [text.reserve(r.value.dtype, loop.length or 0) for r in loop.records]
         before, head, after = text.block, text.label(), text.label()
         text.line(f"br label %{head}")
         text.start(head)
@@ -275,7 +271,7 @@ class LLVM(Backend[Value]):
         if all(map(is_constant, row)):
             table = text.table(dtype, [literal(x) for x in row])
             return lambda count: text.spread(dtype, table, count)
-        array = self.reserve(dtype, len(row))
+        array = self._text.reserve(dtype, len(row))
         for t, x in enumerate(row):
             text.store(self.value(x, values), self._text.at(array, dtype, t), dtype)
         return lambda count: Memory(self._text.at(array, dtype, count), dtype)

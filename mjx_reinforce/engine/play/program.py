@@ -29,7 +29,7 @@ BRANCH_COST = 40
 #: Loops stay loops: the Runge-Kutta stages too, which are a scan of four.
 LOOPS = Limits(scans=1, unrollable=1)
 #: On GPUs a loop over few contacts is written out: an array that a loop reads is in memory there.
-GPU_LOOPS = LOOPS._replace(unrollable=lockstep.WRITTEN_OUT)
+GPU_LOOPS = LOOPS._replace(unrollable=25)
 #: The folders whose files decide what is written for a step.
 _WRITERS = ("mjx_reinforce.engine",)
 
