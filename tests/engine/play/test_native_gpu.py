@@ -18,7 +18,7 @@ from mjx_reinforce.engine import scalar
 from mjx_reinforce.engine.gpu import kernel as kernels
 from mjx_reinforce.engine.gpu import lockstep, ptx, seam
 from mjx_reinforce.engine.physics import touching
-from mjx_reinforce.engine.play import available, choice, native, objects, program, rollouts
+from mjx_reinforce.engine.play import available, choice, native, program, rollouts
 from mjx_reinforce.engine.scalar import scalarized
 
 if reason := available.unavailable():
