@@ -110,6 +110,7 @@ def test_a_wrong_distribution_is_seen():
     assert parity.same_distribution(x, y[np.linalg.norm(y, axis=1) < 1]) < 1e-3
 
 
+@pytest.mark.slow
 def test_reward_of_a_fall_and_of_a_broken_state():
     for id, at_fall in (("InvertedPendulum-v5", 0.0), ("InvertedPendulum-v4", 1.0)):
         env = envs.make(id)

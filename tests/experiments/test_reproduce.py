@@ -74,6 +74,7 @@ def test_a_case_fits_its_record(case):
     assert len(reached(own, case.counts[-1])) == len(own["seeds"])
 
 
+@pytest.mark.slow
 def test_end_to_end(monkeypatch, capsys):
     case = next(case for case in CASES if case.references == ("002_ars_fixed2",))
     monkeypatch.setattr(reproduce, "CASES", (case,))

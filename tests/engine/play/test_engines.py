@@ -196,6 +196,7 @@ def test_outputs_that_are_not_the_distributions():
         unroll(vec.env, act, None, family, state, KEY, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
 def test_segments_go_on(autoreset):
     """Two of 20 steps are one of 40; what they say fits together."""

@@ -77,6 +77,7 @@ def test_only_active_episodes_are_played():
     assert (some.simulated > 0).tolist() == [True, False, True]
 
 
+@pytest.mark.slow
 def test_episodes_have_keys_of_their_own():
     env, keys = Drifting(), jax.random.split(jax.random.key(1), 9)
     actor, act, distribution = actor_and_act(env, (5,))
@@ -130,6 +131,7 @@ def test_a_nan_stays_in_its_lane():
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.slow
 @pytest.mark.cpu
 def test_double_precision():
     """Networks have float32 parameters, whatever jax_enable_x64 says."""
@@ -228,25 +230,6 @@ def test_auto_falls_back_whatever_the_writer_raises(monkeypatch):
         assert f"it cannot be written out ({type(error).__name__}" in engine.why
         with pytest.raises(ValueError, match="native engine cannot play this: it cannot be writ"):
             chosen(Drifting(), "native")
-
-
-class Panorama(Drifting):
-    """Sees 2,000 numbers."""
-
-    def reset(self, rng):
-        state = super().reset(rng)
-        return state.replace(obs=jnp.tile(state.obs, 1_000))
-
-    def step(self, state, action):
-        return state.replace(obs=0.9 * state.obs, reward=jnp.sum(state.obs))
-
-
-def test_wide_observations_are_not_for_machine_code():
-    engine = chosen(Panorama())
-    assert engine.name == "vmap"
-    assert "109 s, more than 80 s, because of an observation of 2,000 entries" in engine.why
-    assert available.announcement(Panorama()) is None
-    assert available.announcement(Drifting()) is None
 
 
 @pytest.mark.cpu
