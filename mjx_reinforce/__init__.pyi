@@ -33,7 +33,7 @@ from mjx_reinforce.published.variants import (
     minibatches,
     normalized_returns,
 )
-from mjx_reinforce.runs.run import RunResults, run
+from mjx_reinforce.runs.results import RunResults, SweepResults, run, sweep
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import of_task
 from mjx_reinforce.statistics import iqm, iqm_interval, mean_interval
@@ -43,7 +43,6 @@ from mjx_reinforce.statistics.comparisons import (
     probability_of_improvement,
 )
 from mjx_reinforce.statistics.survival import kaplan_meier, log_rank
-from mjx_reinforce.sweeps.perform import SweepResults, sweep
 from mjx_reinforce.training.block import evaluate
 from mjx_reinforce.training.driver import Evaluation
 
@@ -61,7 +60,6 @@ from . import runs as runs
 from . import settings as settings
 from . import statistics as statistics
 from . import store as store
-from . import sweeps as sweeps
 from . import training as training
 
 __version__: str

@@ -39,6 +39,12 @@ def write_bytes(path: Path, content: bytes) -> None:
         _sync(path.parent)
 
 
+def remove_parts(*folders: Path) -> None:
+    """Removes what a crash left of ``write_bytes`` in folders, which need not exist."""
+    for part in (part for folder in folders for part in folder.glob(".*." + 8 * "[0-9a-f]")):
+        part.unlink()
+
+
 def check_folder(folder: Path) -> None:
     """Raises ValueError if no file can be made in a folder; /proc says that it could."""
     try:

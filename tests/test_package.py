@@ -34,14 +34,14 @@ ORDER = (
         "export",
         "statistics",
     ),
-    *("reports", "training", "store", "runs", "playing", "report", "sweeps", "sweep", "train"),
+    *("reports", "training", "store", "playing", "report", "runs", "sweep", "train"),
     *("watch", "new", "__main__"),
 )
 #: Commands of folders, found where ``python -m`` looks for them. They use what comes later.
 COMMANDS = {"envs.__main__"}
 #: Who may know that our environments exist; all others take any environment as an argument.
 MAY_IMPORT_ENVS = {
-    *("envs", "settings", "training", "store", "runs", "playing", "sweeps"),
+    *("envs", "settings", "training", "store", "runs", "playing"),
     *("gym", "train", "watch", "new", "__main__"),
 }
 
@@ -173,7 +173,7 @@ def test_the_engine_stands_by_itself():
     assert (instant, others, ours) == ("False", "[]", "[]")
 
 
-@pytest.mark.parametrize("command", ["train", "sweeps.design", "export.__main__", "new"])
+@pytest.mark.parametrize("command", ["train", "runs.sweep_command", "export.__main__", "new"])
 def test_what_reads_a_command_line_is_light(command):
     """So that --help, and what is refused, take no second."""
     loaded = run(f"import sys, mjx_reinforce.{command}\nprint('jax' in sys.modules)")
@@ -184,8 +184,9 @@ def test_pages_films_and_logs_wait():
     """What draws and logs is imported when something is drawn or logged."""
     late = ("vl_convert", "jinja2", "tensorboardX", "matplotlib", "PIL")
     loaded = run(
-        "import sys, mjx_reinforce.train, mjx_reinforce.watch, mjx_reinforce.sweeps.command_line\n"
-        "import mjx_reinforce.runs.run, mjx_reinforce.runs.observers, mjx_reinforce.store.ready\n"
+        "import sys, mjx_reinforce.train, mjx_reinforce.watch, mjx_reinforce.runs.sweep_command\n"
+        "import mjx_reinforce.runs.results, mjx_reinforce.runs.run_files\n"
+        "import mjx_reinforce.store.ready\n"
         f"print([m for m in {late} if m in sys.modules])"
     )
     assert loaded.strip() == "[]"

@@ -10,7 +10,7 @@ COMMANDS = {
     "train": ("mjx_reinforce.train", "train policies, many seeds at once"),
     "watch": ("mjx_reinforce.watch", "make a film of a trained policy, by default of the last run"),
     "sweep": (
-        "mjx_reinforce.sweeps.command_line",
+        "mjx_reinforce.runs.sweep_command",
         "train many configurations at once, and compare them",
     ),
     "report": ("mjx_reinforce.report", "make a page of figures of runs and sweeps"),

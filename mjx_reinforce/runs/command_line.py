@@ -1,21 +1,26 @@
-"""The command line of ``python -m mjx_reinforce.train``: presets, flags, and runs that go on."""
+"""The command lines that train: presets, flags, what goes on, and what ends in a line."""
 
 import dataclasses
+import gc
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
-from mjx_reinforce.console.streams import say_error
+from mjx_reinforce.console.interrupt import Interrupt
+from mjx_reinforce.console.streams import accept_everything, say_error, silence_alarms
+from mjx_reinforce.runs.design import Design, SweepSettings, check_swept, read_design, read_over
+from mjx_reinforce.runs.directory import choose_directory
 from mjx_reinforce.settings.config import (
     Config,
     changed,
     check_named,
     check_read,
+    code_flags,
     is_read,
     read_seeds,
 )
@@ -25,27 +30,45 @@ from mjx_reinforce.settings.groups import GROUPS, MAIN, UNUSUAL
 from mjx_reinforce.settings.tables import PRESETS
 from mjx_reinforce.training import resume
 
-#: What a run leaves in its directory.
-_LEFT_BEHIND = (
-    "config.json",
-    "metrics.csv",
-    "returns.npz",
-    "summary.json",
-    "learning_curve.png",
-    "policy/",
-    "checkpoint/",
-)
-_DESCRIPTION = (
-    "Train policies by REINFORCE on MuJoCo, many seeds at once, and report over the seeds. "
-    f"Leaves {', '.join(_LEFT_BEHIND)} in the run directory.\n\n"
+if TYPE_CHECKING:
+    from mjx_reinforce.runs.perform import Outcome
+
+
+class _Program(NamedTuple):
+    """A command that trains.
+
+    about: its description
+    groups: its settings, dataclasses under their titles
+    main: those that --help alone shows, beside a run's own
+    """
+
+    about: str
+    groups: Mapping[str, type]
+    main: Sequence[str] = ()
+
+
+_TRAIN = _Program(
+    "Train policies by REINFORCE on MuJoCo, many seeds at once, and report over the seeds. Leaves "
+    "config.json, metrics.csv, returns.npz, summary.json, learning_curve.png, policy/, checkpoint/ "
+    "in the run directory.\n\n"
     "Defaults depend on the task and on the budget: --help shows those of InvertedPendulum-v5, "
     "--help --env ID those of another, for about a minute of training here, and with "
-    "--env-steps N those for N env steps."
+    "--env-steps N those for N env steps.",
+    GROUPS,
+)
+_SWEEP = _Program(
+    "Train many configurations, many seeds of each, side by side. Leaves sweep.json, results.csv "
+    "(a row for each configuration and seed), curves.npz, report.html and policies/ (those of the "
+    "best and the worst seed of each configuration) in the output directory. "
+    "All settings of python -m mjx_reinforce.train may be given, with its presets, and most may be "
+    "swept. Seed 3 of a configuration is seed 3 of train with these settings, up to rounding.",
+    {"sweep": SweepSettings, **GROUPS},
+    ("over", "chunk_runs", "exact", "env", "env_steps", "num_seeds", "output", "resume"),
 )
 
 
-def parse(arguments: Sequence[str]) -> Config:
-    """Returns the settings that a command line asks for; --help exits.
+def parse(arguments: Sequence[str]) -> Design:
+    """Returns the run that a command line asks for; --help exits.
 
     Args:
       arguments: a preset's name, if any, then flags.
@@ -56,25 +79,49 @@ def parse(arguments: Sequence[str]) -> Config:
         or is of the user's own environment, which is to be named again.
     """
     default, flags, prog = start(arguments, command("train"))
-    config = _read_config(flags, default, prog)
+    config, _ = _read(_TRAIN, flags, default, prog)
     if config.minutes is not None and flag_value(flags, "--env-steps"):
         raise ValueError(
             f"--minutes {config.minutes:g} and --env-steps {config.env_steps} both say when the "
             "run ends; leave one out"
         )
-    if config.resume is None:
-        return config
-    known = resume.read_settings(config.resume)
-    asked = _read_config(flags, known, prog)
-    resume.check_settings(known, asked)
-    if resume.is_done(known, asked):
+    if (resumed := config.resume) is None:
+        check_read(config, changed(config, default))
+        return Design(base=config, default=default)
+    known = resume.read_settings(resumed)
+    config, _ = _read(_TRAIN, flags, known, prog)
+    check_read(config, changed(config, known))
+    resume.check_settings(known, config)
+    if resume.is_done(known, config):
         print(
-            f"{known.resume} is finished; to go on, give a larger --env-steps or --max-updates, or "
+            f"{resumed} is finished; to go on, give a larger --env-steps or --max-updates, or "
             "--minutes"
         )
         sys.exit(0)
-    check_named(vars(known), named_code(arguments), config.resume)
-    return asked
+    check_named(vars(known), named_code(arguments), resumed)
+    return Design(base=config)
+
+
+def parse_sweep(arguments: Sequence[str]) -> Design:
+    """Returns the sweep that a command line asks for; --help exits.
+
+    Args:
+      arguments: a preset's name, if any, then flags.
+
+    Raises:
+      ValueError: see ``parse`` and ``read_over``; or flags would change a sweep that goes on.
+    """
+    default, flags, prog = start(arguments, command("sweep"))
+    base, settings = _read(_SWEEP, flags, default, prog)
+    if base.resume is None:
+        over = read_over(settings.pop("over"))
+        check_swept(over)
+        return Design(base=base, default=default, over=over, **settings)
+    known = read_design(base.resume)
+    if _read(_SWEEP, flags, known.base, prog) != (known.base, vars(SweepSettings())):
+        raise ValueError(f"the sweep in {base.resume} goes on as it is: give --resume alone")
+    check_named(vars(known.base), named_code(flags), base.resume)
+    return known
 
 
 def start(arguments: Sequence[str], prog: str) -> tuple[Config, Sequence[str], str]:
@@ -112,40 +159,18 @@ def _default(arguments: Sequence[str]) -> Config:
     return dataclasses.replace(known, resume=None)
 
 
-def _read_config(arguments: Sequence[str], default: Config, prog: str) -> Config:
-    """Returns the settings that flags ask for, with others as given; --help exits."""
-    said = _DESCRIPTION if asks_brief_help(arguments) else f"{_DESCRIPTION}\n\n{_names()}"
-    config, _ = read_groups(GROUPS, arguments, default, prog, said, _main_settings(default))
-    check_read(config, changed(config, default))
-    return config
-
-
-def _main_settings(default: Config) -> list[str]:
-    """Returns what --help alone shows of the settings with these defaults."""
-    own = changed(default, Config())
-    unusual = [name for cause, shown in UNUSUAL.items() if cause in own for name in shown]
-    return [*(name for name in MAIN if is_read(name, default)), *unusual]
-
-
-def read_groups(
-    groups: Mapping[str, type],
-    arguments: Sequence[str],
-    default: Config,
-    prog: str,
-    description: str,
-    main: Sequence[str],
+def _read(
+    program: _Program, arguments: Sequence[str], default: Config, prog: str
 ) -> tuple[Config, dict[str, Any]]:
     """Returns the settings of a run as flags ask for them, and those that are no run's, by name.
 
     --help exits.
 
     Args:
-      groups: dataclasses under their titles.
+      program: the command.
       arguments: the flags.
       default: holds for the settings of a run that no flag names.
       prog: the name of the program, for --help.
-      description: of the program, for --help.
-      main: the settings that --help alone shows.
 
     Raises:
       ValueError: see ``flags.read_command_line``; or the flags say by --seeds and by --num-seeds
@@ -154,10 +179,13 @@ def read_groups(
     known = vars(default)
     forms = [
         (title, group, group(**{f.name: known[f.name] for f in fields(group) if f.name in known}))
-        for title, group in groups.items()
+        for title, group in program.groups.items()
     ]
     form = dataclasses.make_dataclass("Arguments", forms, frozen=True)
-    parsed = vars(read_command_line(form, arguments, prog, description, main))
+    about, main = program.about, program.main or _main_settings(default)
+    if not asks_brief_help(arguments):
+        about = f"{about}\n\n{_names()}"
+    parsed = vars(read_command_line(form, arguments, prog, about, main))
     found = {name: x for group in parsed.values() for name, x in vars(group).items()}
     config = Config(**{name: found.pop(name) for name in known})
     if config.seeds is not None:
@@ -167,6 +195,13 @@ def read_groups(
             )
         config = dataclasses.replace(config, num_seeds=len(read_seeds(config.seeds)))
     return config, found
+
+
+def _main_settings(default: Config) -> list[str]:
+    """Returns what --help alone shows of the settings with these defaults."""
+    own = changed(default, Config())
+    unusual = [name for cause, shown in UNUSUAL.items() if cause in own for name in shown]
+    return [*(name for name in MAIN if is_read(name, default)), *unusual]
 
 
 def _names() -> str:
@@ -179,24 +214,84 @@ def _names() -> str:
     )
 
 
-def refuse_full(
-    error: RuntimeError | OSError, what: str, part: str, flag: str, again: str
+def train_to_the_end(
+    read: Callable[[Sequence[str]], Design], end: Callable[["Outcome"], object]
 ) -> NoReturn:
-    """Refuses what met a full memory or disk, as ``refuse``; raises any other error again.
+    """Does what a command line asks for, and exits.
+
+    The status is 0 when done, 1 if files cannot be written or nothing is finite any more, 2 for bad
+    input, 130 after Ctrl-C and 143 after SIGTERM.
 
     Args:
-      error: XLA's where memory is full, or that of a file.
-      what: whose files they are.
-      part: what has to fit into memory.
-      flag: makes that part smaller.
-      again: what to do once there is room on the disk.
+      read: the words of the command line -> what it asks for.
+      end: says what came of it.
     """
+    accept_everything()
+    silence_alarms()
+    with Interrupt() as interrupt:
+        # Imports and tracing make many objects and no garbage: that saves a second in eight.
+        gc.disable()
+        try:
+            status = _train(read, end, interrupt)
+        finally:
+            gc.enable()
+    sys.exit(status)
+
+
+def _train(
+    read: Callable[[Sequence[str]], Design],
+    end: Callable[["Outcome"], object],
+    interrupt: Interrupt,
+) -> int:
+    """Returns the exit status of a command line."""
+    try:
+        design = _in_a_directory(read(sys.argv[1:]))
+        from mjx_reinforce.runs.perform import perform
+    except ValueError as error:
+        refuse(str(error))
+    try:
+        outcome = perform(design, interrupt, compiled=_collect_again)
+        end(outcome)
+    except ValueError as error:
+        refuse(str(error))
+    except (ImportError, MemoryError) as error:
+        remedy = "see pip check, and ulimit -v where memory is short"
+        refuse(f"cannot load what this package needs ({error}); {remedy}")
+    except (RuntimeError, OSError) as error:
+        _refuse_full(error, design)
+    if outcome.summary["status"] != "interrupted" or interrupt.number is None:
+        return int(outcome.summary["status"] == "stopped")
+    if design.over:  # not at the end of a compiler's thread
+        interrupt.leave(128 + interrupt.number)
+    return 128 + interrupt.number
+
+
+def _in_a_directory(design: Design) -> Design:
+    """Returns a design that says where its directory is."""
+    base = design.base
+    if base.resume is None:
+        base = dataclasses.replace(base, output=choose_directory(base.output, base.env))
+    return dataclasses.replace(design, base=base)
+
+
+def _collect_again() -> None:
+    """Starts the garbage collector, which never looks again at the objects that are there."""
+    gc.freeze()
+    gc.enable()
+
+
+def _refuse_full(error: RuntimeError | OSError, design: Design) -> NoReturn:
+    """Refuses what met a full memory or disk, as ``refuse``; raises any other error again."""
     if isinstance(error, OSError):
+        directory, what = design.resume or design.base.output, "sweep" if design.over else "run"
+        again = "try again"
+        if directory is not None and (directory / design.first_file).exists():
+            again = f"go on with --resume {directory}{code_flags(vars(design.base))}"
         room = "make room, then" if error.errno else "then"  # W&B's have no number
-        message = f"cannot write the files of {what} ({error}); {room} {again}"
-        refuse(message, status=1)
+        refuse(f"cannot write the files of this {what} ({error}); {room} {again}", status=1)
     if "RESOURCE_EXHAUSTED" not in str(error):
         raise error
+    part, flag = ("a chunk", "--chunk-runs") if design.over else ("this run", "--num-seeds")
     flags = f"{flag}, --num-episodes, --eval-episodes or --horizon"
     if os.environ.get("XLA_PYTHON_CLIENT_PREALLOCATE", "").lower() in ("false", "0"):
         flags += "; or unset XLA_PYTHON_CLIENT_PREALLOCATE, with which memory is in pieces"

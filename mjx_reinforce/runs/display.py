@@ -46,7 +46,7 @@ class _Screen(Console):
         self.quiet = True
 
 
-class Display(Observer):
+class Display(Observer[Driver]):
     """A progress bar on a terminal, one line an evaluation elsewhere."""
 
     def __init__(self, *, quiet: bool = False):

@@ -1,233 +1,314 @@
-"""What a run will do, and how much memory it needs, from its settings alone.
+"""From a design to all that a run or a sweep is made of; nothing is compiled.
 
-The factors were read off XLA's own account of its programs (``memory_analysis``), for 100 seeds of
-toys with 4 and 300 observations and 1,000 seeds of InvertedPendulum.
+Configurations are in groups that share their programs, and these in chunks that fit into memory. A
+run is one configuration, whose seeds are one chunk in one slot.
 """
 
-import itertools
-import math
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+import dataclasses
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, NamedTuple
 
-from mjx_reinforce.engine.memory import gigabytes, host_memory
-from mjx_reinforce.settings.config import MAX_OF_UPDATE, Config, flag, marked
-from mjx_reinforce.settings.declare import Range
-from mjx_reinforce.settings.defaults import may_have_accelerator, num_cores
+import jax
+import numpy as np
+
+from mjx_reinforce import envs
+from mjx_reinforce.engine.base import Environment
+from mjx_reinforce.engine.memory import host_memory
+from mjx_reinforce.registry import is_own
+from mjx_reinforce.reports.experiment import counted
+from mjx_reinforce.runs.design import Design, configure
+from mjx_reinforce.settings.config import MAX_COUNT, Config, marked
+from mjx_reinforce.settings.declare import Mark
+from mjx_reinforce.settings.defaults import num_cores
 from mjx_reinforce.settings.groups import Reader
-from mjx_reinforce.settings.tables import TASKS, Task
-
-if TYPE_CHECKING:
-    from mjx_reinforce.store.ready import Ready
-    from mjx_reinforce.training.division import Division
-
-#: A small run of a task that was not measured takes so much memory, like most (bytes).
-_BASE_MEMORY = 2.5e9
-_FLOAT = 4  # bytes
-#: Copies of the episodes that a gradient needs: as played, scaled, and by time.
-_EPISODE_COPIES = 3
-#: The values of the hidden units, and what the gradient adds to them.
-_ACTIVATIONS = 2
-#: Parameters, gradient, two moments, and all that again while a seed's update is proposed.
-_PARAMETERS = 8
-#: The same of a value network: parameters, gradient, two moments.
-_CRITIC_PARAMETERS = 4
-#: Steps of an episode whose hidden units are held at once, see ``learning.updates``.
-_CHUNK = 128
-#: Bytes of an env step that an evaluation plays: the reward, the mask, and copies.
-_EVALUATED = 10
-#: Numbers that a seed's update reports.
-_REPORTED = 20
+from mjx_reinforce.store.provenance import provenance
+from mjx_reinforce.store.ready import Ready, get_ready, made
+from mjx_reinforce.training import resume
+from mjx_reinforce.training.checkpoint import Checkpoint
+from mjx_reinforce.training.division import Division, divide_run
+from mjx_reinforce.training.record import Runs
+from mjx_reinforce.training.slots import StateRows
+from mjx_reinforce.training.state import last_actors, shape_of_all
 
 
-class Hardware(NamedTuple):
-    """Where a run computes.
+class Group(NamedTuple):
+    """C configurations that share their programs.
 
-    name: for people
-    memory: the memory available to arrays (bytes)
-    shared: whether that is the memory that compiling needs too
+    config: the settings of the first
+    members: [C] their numbers in the sweep
+    settings: [C] each, the numbers that are traced
     """
 
-    name: str
-    memory: float
-    shared: bool
+    config: Config
+    members: np.ndarray
+    settings: dict[str, np.ndarray]
+
+    @property
+    def num_runs(self) -> int:
+        """How many runs it has: each configuration has as many seeds."""
+        return len(self.members) * self.config.num_seeds
 
 
-def make_plan(ready: "Ready", config: Config) -> str:
-    """Returns a paragraph on what a run will do on this machine.
+class Part(NamedTuple):
+    """A group that is ready to be trained.
+
+    group: its configurations
+    ready: what their programs are made of
+    limit: how many of its runs a chunk may have
+    widths: runs that a compiled program moves at once, the most first
+    chunks: its runs, in parts of about the same size
+    """
+
+    group: Group
+    ready: Ready
+    limit: int
+    widths: tuple[int, ...]
+    chunks: list[Runs]
+
+
+class Prepared(NamedTuple):
+    """All that a run or a sweep is made of.
+
+    design: what it is to do
+    parts: its groups
+    division: among which devices the runs are divided
+    known: what the first file of its directory says, if it goes on
+    found: the checkpoint from which a run goes on, if any
+    """
+
+    design: Design
+    parts: list[Part]
+    division: Division
+    known: Mapping[str, Any]
+    found: Checkpoint | None
+
+    @property
+    def alone(self) -> bool:
+        """Whether it is a run, which is one configuration."""
+        return not self.design.over
+
+    @property
+    def engine_seconds(self) -> float:
+        """Wall time that making the engines took."""
+        return sum(part.ready.engine_seconds for part in self.parts)
+
+
+def prepare(design: Design, env: Environment | None, say: Callable[[str], None]) -> Prepared:
+    """Returns what a run or a sweep is made of.
 
     Args:
-      ready: the run, a ``ready.Ready``.
-      config: its settings.
+      design: of it.
+      env: the environment of a run, if it is built already.
+      say: shows a line to the user.
 
     Raises:
-      ValueError: the run does not fit into the memory that is here.
+      ValueError: settings do not fit the environment, or it cannot go on here.
     """
-    what = _what(config)
-    task, machine = task_of(ready.policy, ready.horizon, config), this_hardware()
-    division = ready.programs.division
-    if not machine.shared:
-        config = division.of_each(config, config.num_seeds)
-    base = task.base_memory if machine.shared else 0.0
-    check_fits(config, task, machine.memory, base)
-    memory = gigabytes(base + needed(config, task))
-    where = _where(machine, division)
-    return (
-        f"Training {what} on {where}, with the engine {ready.engine}: "
-        f"{ready.why}. It needs about {memory} of memory."
-    )
+    known = {}
+    if design.resume is not None:
+        known = resume.read_record(design.resume, design.first_file)
+        resume.check_same_program(design.resume, known, provenance())
+    if design.over:
+        return _prepare_sweep(design, known)
+    config, division, found = design.base, divide_run(design.base), None
+    ready = get_ready(config, design.default or config, env)
+    if config.resume is not None:
+        found = _find(config, ready, say)
+    if config.init_from is not None and found is None:
+        last_actors(config, ready.policy)  # refused before anything is compiled
+    group, width = Group(config, np.zeros(1, int), {}), division.lanes(config.num_seeds)
+    part = Part(group, ready, config.num_seeds, (width,), split_runs(group, "000", 1))
+    return Prepared(design, [part], division, known, found)
 
 
-def _where(machine: Hardware, division: "Division") -> str:
-    """Returns on what a run trains, and how many devices here are left out."""
-    import jax
+def _find(config: Config, ready: Ready, say: Callable[[str], None]) -> Checkpoint | None:
+    """Returns the checkpoint from which a run in its directory goes on, if there is one.
 
-    here, name = jax.local_device_count(), machine.name
-    if division.count > 1:
-        what = "seeds" if division.seeds > 1 else "episodes of an update"
-        return f"{devices_in_words(division.count, machine)}, which share the {what}"
-    if here > 1 and not machine.shared:
-        name += f", the first of the {here} here,"
-    return name
-
-
-def devices_in_words(count: int, machine: Hardware) -> str:
-    """Returns how many devices compute, of how many here."""
-    import jax
-
-    here = jax.local_device_count()
-    said = f"{count} devices" if count == here else f"{count} of the {here} devices here"
-    return said if machine.shared else f"{said} ({machine.name} each)"
+    Raises:
+      ValueError: the run cannot go on here.
+    """
+    like = shape_of_all(ready.programs().like, config.num_seeds)
+    if config.minutes is None:
+        return resume.newest_checkpoint(like, config, say)
+    # More than any checkpoint has used.
+    found = resume.newest_checkpoint(like, dataclasses.replace(config, env_steps=MAX_COUNT), say)
+    if found is None:
+        raise ValueError(
+            f"{config.resume} has no checkpoint to go on from for {config.minutes:g} min; leave "
+            "--minutes out to train it again, or start another run"
+        )
+    return found
 
 
-def this_hardware() -> Hardware:
-    """Returns where JAX computes."""
-    import jax
+def _prepare_sweep(design: Design, known: Mapping[str, Any]) -> Prepared:
+    """Returns what a sweep is made of; ``known`` is its sweep.json, if it goes on."""
+    # A program for several devices need not round as the one for a single device does.
+    division = Division(seeds=1 if design.exact else jax.local_device_count())
+    old = known.get("local_devices", division.count)
+    if old != division.count:
+        raise ValueError(
+            f"{design.resume} was begun on {old} devices, and here are {division.count}; go on "
+            "with as many"
+        )
+    configs, parts = configure(design.base, design.configurations()), []
+    for number, group in enumerate(make_groups(configs, tuple(design.over), exact=design.exact)):
+        env = envs.make_set(group.config.env, group.config.env_set)
+        ready = made(env, group.config, division, tuple(group.settings))
+        part, limit = Part(group, ready, 0, (), []), design.chunk_runs
+        if known:
+            limit = known["chunk_runs"][number]
+        elif limit is None:
+            limit = max(_capacity(part), division.count)
+        limit = limit if known else min(limit, group.num_runs)
+        count, widths = divide(group, limit, division.count, exact=design.exact)
+        chunks = split_runs(group, f"{number:03d}", count)
+        parts.append(part._replace(limit=limit, widths=widths, chunks=chunks))
+    return Prepared(design, parts, division, known, None)
 
-    device = jax.local_devices()[0]
-    if device.platform == "cpu":
-        cores = num_cores()
-        name = f"{cores} CPU core{'s' * (cores > 1)}"
-        return Hardware(name, host_memory(), True)
-    memory = float((device.memory_stats() or {}).get("bytes_limit", float("inf")))
-    return Hardware(f"one {device.device_kind}", memory, False)
 
-
-def _what(config: Config) -> str:
-    """Returns what is trained and for how long."""
-    budgets, each = [], " each" if config.minutes is None else ""
-    if config.minutes is not None:
-        budgets.append(f"{config.minutes:g} min together")
-    elif config.env_steps is not None:
-        budgets.append(f"{config.env_steps:,} env steps")
-    if config.max_updates is not None:
-        budgets.append(f"{config.max_updates:,} updates")
-    seeds = f"{config.num_seeds:,} seed{'s' * (config.num_seeds > 1)}"
-    return f"{seeds} of {config.env} by {config.algorithm}, {' or '.join(budgets)}{each},"
-
-
-def task_of(policy: Mapping[str, Any], horizon: int, config: Config) -> Task:
-    """Returns the sizes of a task, also of the user's own.
+def make_groups(configs: Sequence[Config], swept: Collection[str], *, exact: bool) -> list[Group]:
+    """Returns the configurations of a sweep in groups, in the order of their first members.
 
     Args:
-      policy: what ``build.policy_settings`` returns.
-      horizon: the time limit of an episode in steps.
-      config: the settings.
+      configs: of the sweep.
+      swept: the settings in which they differ.
+      exact: trace every number that may be, so that what is swept beside it changes no program.
     """
-    if config.env in TASKS:
-        known = TASKS[config.env]
-        return known._replace(observation=policy["observation_size"]) if config.env_set else known
-    entries = 1 if "num_actions" in policy else len(policy["action_low"])
-    return Task(policy["observation_size"], entries, horizon, _BASE_MEMORY)
+    members: dict[Any, list[int]] = {}
+    traced = [_traced(config, swept, exact) for config in configs]
+    for number, (config, settings) in enumerate(zip(configs, traced, strict=True)):
+        compiled = dataclasses.replace(config, **dict.fromkeys(settings, None))
+        members.setdefault((dataclasses.astuple(compiled), tuple(settings)), []).append(number)
+    return [
+        Group(
+            configs[numbers[0]],
+            np.array(numbers),
+            {name: np.array([traced[i][name] for i in numbers]) for name in traced[numbers[0]]},
+        )
+        for numbers in members.values()
+    ]
 
 
-def parts(config: Config, task: Task) -> dict[str, float]:
-    """Returns what the arrays of a run need (bytes), under the flags that make each part smaller.
-
-    Args:
-      config: the settings.
-      task: the sizes of the task; ``config`` may have another time limit.
-    """
-    horizon = config.training_horizon(task.horizon)
-    seeds, episodes = config.num_seeds, config.episodes_per_update
-    steps = seeds * horizon * episodes
-    values = task.observation + task.action + 3
-    evaluated = seeds * (config.horizon or task.horizon) * 2 * config.eval_episodes
-    follows = Reader.GRADIENT.holds(config)  # else it tries out many policies
-    fewer = "--num-episodes" if follows else "--hidden-sizes"
-    held = seeds * (min(horizon, _CHUNK) if follows else 1) * episodes * sum(config.hidden_sizes)
-    policies = seeds if follows else seeds * episodes
-    network = _ACTIVATIONS * held + _PARAMETERS * policies * num_parameters(config, task)
-    critic = config.value_hidden_sizes if Reader.VALUE_BASELINE.holds(config) else ()
-    critics = _CRITIC_PARAMETERS * seeds * critic_parameters(config, task)
-    valued, fitted = steps, 0
-    if critic and Reader.REINFORCE.holds(config):
-        fitted = seeds * config.value_batch_size
-        valued = seeds * min(horizon, _CHUNK) * episodes
-    fitting = fitted * (config.value_fits + values + _ACTIVATIONS * sum(critic))
-    valuing = _ACTIVATIONS * valued * sum(critic) + critics
+def _traced(config: Config, swept: Collection[str], exact: bool) -> dict[str, float]:
+    """Returns the numbers of a configuration that its programs take as arguments."""
+    if is_own(config.algorithm):
+        return {}
+    names = set(marked(Mark.TRACED))
+    for reader in (Reader.GRADIENT, Reader.REINFORCE):
+        names.difference_update(() if reader.holds(config) else marked(reader))
+    if not (Reader.REINFORCE.holds(config) and Reader.FREE_STD.holds(config)):
+        # Others have ``initial_std`` in their actions, which an engine may compile.
+        names.discard("initial_std")
+    settings = {name: getattr(config, name) for name in sorted(names) if exact or name in swept}
+    if not Reader.DECAY.holds(config):
+        settings.pop("final_learning_rate", None)
+    elif "learning_rate" in settings and config.final_learning_rate is None:
+        settings["final_learning_rate"] = config.learning_rate / 10
     return {
-        "--value-batch-size, --value-fits or --num-seeds": _FLOAT * fitting,
-        f"--num-seeds, {fewer} or --train-horizon": _FLOAT * _EPISODE_COPIES * steps * values,
-        f"--hidden-sizes, --num-seeds or {fewer}": _FLOAT * network,
-        "--value-hidden-sizes, --num-seeds or --train-horizon": _FLOAT * valuing,
-        "--eval-episodes, --num-seeds or --horizon": _EVALUATED * evaluated,
-        "--eval-every or --num-seeds": _FLOAT * _REPORTED * seeds * config.block_length,
+        name: float(value)
+        for name, value in settings.items()
+        if not (value is None or isinstance(value, str))
     }
 
 
-def num_parameters(config: Config, task: Task) -> int:
-    """Returns how many parameters the policy has, about: mean and std have outputs of their own."""
-    return _num_weights([task.observation, *config.hidden_sizes, 2 * task.action])
+#: The states of a chunk take up to this part of the host's memory, with copies of them. So few runs
+#: are one chunk whatever they take: to know that takes a second a group.
+_MEMORY, _COPIES, _FEW = 0.6, 5, 256
+#: Episodes side by side in a slot of a device; the widest slot first. On two CPU cores a run costs
+#: the same beside 7 others or 255, and narrow slots waste less on runs of other lengths. An H200
+#: needs 65,536 episodes for most of its speed; for few runs a narrow slot answers sooner.
+_CPU_EPISODES = (128,)
+_GPU_EPISODES = (65_536, 8_192)
 
 
-def critic_parameters(config: Config, task: Task) -> int:
-    """Returns how many parameters the value network has, 0 where there is none."""
-    if not (Reader.GRADIENT.holds(config) and Reader.VALUE_BASELINE.holds(config)):
-        return 0
-    return _num_weights([task.observation, *config.value_hidden_sizes, 1])
-
-
-def _num_weights(widths: Sequence[int]) -> int:
-    """Returns how many parameters a network has whose layers are so wide, the input first."""
-    return sum((n + 1) * m for n, m in itertools.pairwise(widths))
-
-
-def needed(config: Config, task: Task) -> float:
-    """Returns the bytes that all arrays of a run need."""
-    return math.fsum(parts(config, task).values())
-
-
-def check_fits(config: Config, task: Task, available: float, base: float) -> None:
-    """Raises ValueError if a run needs more memory than there is; nothing is compiled.
+def divide(
+    group: Group, limit: int, num_devices: int, *, exact: bool
+) -> tuple[int, tuple[int, ...]]:
+    """Returns ``num_chunks`` and ``widths`` of a part.
 
     Args:
-      config: the settings.
-      task: the sizes of the task.
-      available: bytes that are there.
-      base: bytes that are needed besides the arrays.
+      group: whose configurations have ``group.config.num_seeds`` runs each.
+      limit: runs in a chunk at most.
+      num_devices: among which a chunk is divided.
+      exact: one run a slot.
     """
-    total = base + needed(config, task)
-    if total <= available:
-        return
-    found = parts(config, task)
-    raise ValueError(
-        f"this run does not fit into memory: it needs about {gigabytes(total)}, "
-        f"{gigabytes(available)} are here;\nlower {max(found, key=found.__getitem__)}"
+    total = group.num_runs
+    num_chunks = -(-total // limit)
+    if exact:
+        return num_chunks, (num_devices,)
+    most = -(-total // (num_chunks * num_devices))
+    side = _CPU_EPISODES if jax.default_backend() == "cpu" else _GPU_EPISODES
+    each = {min(most, -(-count // group.config.episodes_per_update)) for count in side}
+    return num_chunks, tuple(num_devices * width for width in sorted(each, reverse=True))
+
+
+def split_runs(group: Group, name: str, num_chunks: int) -> list[Runs]:
+    """Returns the runs of a group in chunks, all of one size except the last.
+
+    Seeds come before configurations, so that every chunk has its share of each configuration and
+    all take about as long.
+
+    Args:
+      group: whose configurations have ``group.config.num_seeds`` runs each.
+      name: of the group, for the files.
+      num_chunks: how many.
+    """
+    total = len(group.members) * group.config.num_seeds
+    size = -(-total // num_chunks)
+    runs = np.arange(total)
+    seed, place = np.divmod(runs, len(group.members))
+    seed += group.config.first_seed
+    return [
+        Runs(f"{name}-{i:04d}", place[part], group.members[place[part]], seed[part])
+        for i, part in enumerate(runs[start : start + size] for start in range(0, total, size))
+    ]
+
+
+def _capacity(part: Part) -> int:
+    """Returns how many runs of a group may be under way, as memory holds their states."""
+    if part.group.num_runs <= _FEW:
+        return _FEW
+    size = StateRows(part.ready.programs().like).size
+    return max(1, int(_MEMORY * host_memory() / (_COPIES * size)))
+
+
+def describe(prepared: Prepared) -> str:
+    """Returns a sentence on what a run or a sweep will do on this machine."""
+    parts, first, ready = prepared.parts, prepared.parts[0].group.config, prepared.parts[0].ready
+    what, said = f"{counted(first.num_seeds, 'seed')} of {first.env}", ""
+    if not prepared.alone:
+        runs = sum(part.group.num_runs for part in parts)
+        count = counted(prepared.design.count(), "configuration")
+        what = f"{count} of {counted(first.num_seeds, 'seed')}, {runs:,} runs of {first.env}"
+        chunks = [len(runs.seed) for part in parts for runs in part.chunks]
+        said = (
+            f"; {counted(len(parts), 'compiled program')}, {counted(len(chunks), 'chunk')} of up "
+            f"to {max(chunks):,} runs"
+        )
+    return (
+        f"Training {what} by {first.algorithm}, {_budget(first)}, on {_where(prepared.division)}, "
+        f"with the engine {ready.engine}: {ready.why}{said}."
     )
 
 
-def check_memory(config: Config) -> None:
-    """Raises ValueError for a run that cannot be, before anything heavy is imported.
+def _budget(config: Config) -> str:
+    """Returns for how long each seed is trained."""
+    if config.minutes is not None:
+        budgets = [f"{config.minutes:g} min together"]
+    else:
+        budgets = [f"{config.env_steps:,} env steps each"] if config.env_steps is not None else []
+    if config.max_updates is not None:
+        budgets.append(f"{config.max_updates:,} updates each")
+    return " or ".join(budgets)
 
-    What is not known yet is taken to be small: the sizes of a task of the user's own, and the
-    memory of an accelerator.
-    """
-    large = (*marked(Range.COUNTED), *marked(Range.SEED))
-    for name, value in vars(config).items():
-        numbers = value if isinstance(value, tuple) else (value,)
-        counts = [x for x in numbers if isinstance(x, int)]
-        if name not in large and max(counts, default=0) > MAX_OF_UPDATE:
-            raise ValueError(f"{flag(name)} must be less than 2^31, got {max(counts)}")
-    if not may_have_accelerator():
-        task = TASKS.get(config.env, Task(1, 1, 1, 0.0))
-        check_fits(config, task, host_memory(), task.base_memory)
+
+def _where(division: Division) -> str:
+    """Returns which devices compute, of how many here."""
+    here, count, kind = jax.local_device_count(), division.count, jax.local_devices()[0].device_kind
+    cpu = jax.default_backend() == "cpu"
+    if count == 1:
+        first = f", the first of the {here} here," if here > 1 else ""
+        return counted(num_cores(), "CPU core") if cpu else f"one {kind}{first}"
+    said = f"{count} devices" if count == here else f"{count} of the {here} devices here"
+    what = "seeds" if division.seeds > 1 else "episodes of an update"
+    return f"{said if cpu else f'{said} ({kind} each)'}, which share the {what},"

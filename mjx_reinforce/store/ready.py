@@ -1,10 +1,13 @@
 """A run made ready: what its settings come to, and its programs before they are compiled."""
 
 import dataclasses
+import functools
+from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
 from mjx_reinforce import envs
 from mjx_reinforce.engine.base import Environment
+from mjx_reinforce.learning.learner import Learner
 from mjx_reinforce.settings.config import Config, check_read_by_policy, check_step_count
 from mjx_reinforce.store import kept
 from mjx_reinforce.store.build import build, policy_settings
@@ -21,7 +24,7 @@ class Ready(NamedTuple):
     engine: the name of what plays the episodes
     why: the reason it was chosen, for people
     engine_seconds: wall time that making it took
-    programs: before they are compiled
+    programs: () -> those of the runs, before they are compiled; made when they are first asked for
     """
 
     horizon: int
@@ -30,7 +33,7 @@ class Ready(NamedTuple):
     engine: str
     why: str
     engine_seconds: float
-    programs: Programs
+    programs: Callable[[], Programs]
 
 
 def get_ready(config: Config, default: Config, env: Environment | None = None) -> Ready:
@@ -52,7 +55,8 @@ def get_ready(config: Config, default: Config, env: Environment | None = None) -
         if key is not None:
             facts = ready._asdict()
             del facts["programs"], facts["engine_seconds"]
-            ready = ready._replace(programs=kept.keep(key, facts, ready.programs))
+            whole = kept.keep(key, facts, ready.programs())
+            ready = ready._replace(programs=lambda: whole)
     if config.resume is None and config.policy == "auto":
         check_read_by_policy(config, default, ready.policy["policy"])
     return ready
@@ -72,16 +76,23 @@ def _found(key: str, config: Config) -> Ready | None:
     facts, programs = found
     programs = programs._replace(division=divide_run(config))
     check_step_count(config, facts["horizon"])
-    return Ready(**facts, engine_seconds=0.0, programs=programs)
+    return Ready(**facts, engine_seconds=0.0, programs=lambda: programs)
 
 
-def made(env: Environment, config: Config, division: Division | None = None) -> Ready:
+def made(
+    env: Environment,
+    config: Config,
+    division: Division | None = None,
+    traced: Collection[str] | None = None,
+) -> Ready:
     """Returns what the settings come to in an environment.
 
     Args:
       env: what is trained on.
       config: the settings.
       division: among which devices they are divided; by default as ``divide_run`` says.
+      traced: of a sweep, the names of the settings that differ from run to run of its programs.
+        None of a run, whose programs measure more.
 
     Raises:
       ValueError: the settings do not fit the environment.
@@ -90,8 +101,26 @@ def made(env: Environment, config: Config, division: Division | None = None) -> 
         division = divide_run(config)
     devices = division.devices() if division.episodes > 1 else None
     learner, horizon = build(env, config, devices=devices)
-    width = division.width(config.num_seeds)
     threshold = getattr(env, "reward_threshold", None)
+
+    def build_learner(settings: dict[str, Any]) -> Learner:
+        if not settings:
+            return learner
+        if config.algorithm != "reinforce":
+            return build(env, dataclasses.replace(config, **settings))[0]
+        # How REINFORCE plays depends on no traced number, and takes a second to write out.
+        other = build(env, dataclasses.replace(config, engine="vmap", **settings))[0]
+        return learner._replace(init=other.init, learn=other.learn)
+
+    @functools.cache
+    def programs() -> Programs:
+        width = division.width(config.num_seeds) if traced is None else 1
+        return programs_of(
+            *(env, build_learner, horizon, config, width, traced or ()),
+            whole=traced is None,
+            division=division,
+        )
+
     return Ready(
         horizon=horizon,
         threshold=None if threshold is None else float(threshold),
@@ -99,5 +128,5 @@ def made(env: Environment, config: Config, division: Division | None = None) -> 
         engine=learner.engine.name,
         why=learner.engine.why,
         engine_seconds=learner.engine.seconds,
-        programs=programs_of(env, lambda _: learner, horizon, config, width, division=division),
+        programs=programs,
     )

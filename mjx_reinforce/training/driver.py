@@ -1,8 +1,8 @@
-"""A run as it goes on: its programs move its state on, and observers see what it measures."""
+"""Runs as they go on: their programs move them, and observers see what they measure."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from mjx_reinforce.files import Arrays
 from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.learning.policy import Actor
-from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.record import Cells, Record, RunRecord
 from mjx_reinforce.training.resume import recordable
@@ -50,26 +50,33 @@ class Evaluation(NamedTuple):
     train_states: TrainState
 
 
-class Observer:
-    """Sees a run go on, and changes nothing of it; what a subclass leaves out does nothing."""
+#: The runs that an observer sees.
+Seen = TypeVar("Seen", bound="Training")
 
-    def updated(self, driver: "Driver", met: Arrays) -> None:
+
+class Observer(Generic[Seen]):
+    """Sees runs go on, and changes nothing of them; what a subclass leaves out does nothing."""
+
+    def began(self, driver: Seen) -> None:
+        """Called before the first update, also of runs that go on."""
+
+    def updated(self, driver: Seen, met: Arrays) -> None:
         """Called after each block of updates.
 
         Args:
-          driver: of the run.
+          driver: of the runs.
           met: the updates in it that met numbers which are not finite, as
-            ``RunRecord.add_updates`` returns them.
+            ``RunRecord.add_updates`` returns them; nothing in a sweep.
         """
 
-    def evaluated(self, driver: "Driver", evaluation: Evaluation, rows: Cells) -> None:
+    def evaluated(self, driver: Seen, evaluation: Evaluation, rows: Cells) -> None:
         """Called after each evaluation, with what it measured and its rows in metrics.csv."""
 
-    def ended(self, driver: "Driver") -> None:
+    def ended(self, driver: Seen) -> None:
         """Called after the last block of updates and its evaluation, before the last test."""
 
-    def finished(self, driver: "Driver", summary: dict[str, Any]) -> None:
-        """Called after the last test, with the contents of summary.json."""
+    def finished(self, driver: Seen, summary: dict[str, Any]) -> None:
+        """Called after the last test, with the contents of summary.json, or of sweep.json."""
 
 
 #: The host need not look at runs more often than this (s). Between short blocks the devices would
@@ -105,16 +112,21 @@ def drive(
 
 
 class Training:
-    """Runs as they go on, such as the seeds of one.
+    """Runs as they go on, such as a part of a sweep's.
 
     config: the settings; one of those that differ from run to run stands for any value
     slots: what moves the runs
     record: what they have measured
+    observers: who sees them, in this order
+    ended: whether an observer asked for the end
     """
 
-    def __init__(self, config: Config, slots: Slots, record: Record):
+    def __init__(
+        self, config: Config, slots: Slots, record: Record, observers: Sequence[Observer[Any]] = ()
+    ):
         """Begins before the first update, where the slots are."""
         self.config, self.slots, self.record = config, slots, record
+        self.observers, self.ended = list(observers), False
         self._began = time.perf_counter()
 
     def restore(self, found: Checkpoint) -> None:
@@ -143,34 +155,53 @@ class Training:
         """Returns how many updates the run with the most has made."""
         return int(self.record.updates.max())
 
+    def drive(self, interrupted: Callable[[], bool]) -> None:
+        """Trains until the budget is used, nothing is finite, or someone asks for the end.
+
+        Args:
+          interrupted: whether the runs are to end soon.
+        """
+        for blocks in drive(
+            self.slots, self.record, lambda: self.ended or interrupted(), self._most()
+        ):
+            self._take(blocks)
+
+    def _most(self) -> int:
+        """Returns how many blocks of updates may be made before anyone looks."""
+        return (self.config.checkpoint_every or MAX_COUNT) // self.config.eval_every
+
+    def _take(self, blocks: list[Measured]) -> None:
+        """Takes in evaluations and the updates after them."""
+        self.record.add(blocks, self.seconds())
+        if blocks[0].metrics:
+            self._updated({})
+
+    def _updated(self, met: Arrays) -> None:
+        for observer in self.observers:
+            observer.updated(self, met)
+
 
 class Driver(Training):
-    """Moves the seeds of a run on, block by block.
+    """The seeds of a run as they go on.
 
     config: the settings of the run, its horizon among them
-    record: what it has measured
     states: of training, on the host
     best: the best policies so far
-    ended: whether an observer asked for the end
     """
 
     record: RunRecord
 
     def __init__(
-        self, config: Config, slots: Slots, record: RunRecord, observers: Sequence[Observer] = ()
+        self,
+        config: Config,
+        slots: Slots,
+        record: RunRecord,
+        observers: Sequence[Observer[Any]] = (),
     ):
-        """Takes what a run is made of, before its first update.
-
-        Args:
-          config: its settings.
-          slots: its seeds, and what moves them on.
-          record: what it measures.
-          observers: who sees it go on, in this order.
-        """
-        super().__init__(config, slots, record)
-        self.observers, self.states = list(observers), slots.states()
+        """Begins before the first update, where the slots are."""
+        super().__init__(config, slots, record, observers)
+        self.states = slots.states()
         self.best = first_best(self.states.train_states)
-        self.ended = False
         #: Wall time at which the present policies were there (s).
         self._reached = 0.0
 
@@ -186,26 +217,24 @@ class Driver(Training):
         return whole._replace(state=(whole.state, self.best), settings=settings)
 
     def drive(self, interrupted: Callable[[], bool]) -> None:
-        """Trains until the budget is used, nothing is finite, or someone asks for the end.
-
-        Args:
-          interrupted: whether the run is to end soon.
-        """
-        for [measured] in drive(self.slots, self.record, lambda: self.ended or interrupted()):
-            self._take(measured)
+        """Trains as any runs; what was made before an observer's end is evaluated."""
+        super().drive(interrupted)
         if not self.record.is_evaluated() and (self.ended or not self.record.begun()):
-            self._take(self.slots.evaluate())
+            self._take([self.slots.evaluate()])
 
-    def _take(self, measured: Measured) -> None:
+    def _most(self) -> int:
+        return 1
+
+    def _take(self, blocks: list[Measured]) -> None:
         """Takes in an evaluation and the updates that followed it."""
+        [measured] = blocks
         before, self.states = self.states.train_states, self.slots.states()
         if measured.looked:
             self._take_evaluation(before, measured.looked)
         if measured.metrics:
             met = self.record.add_updates(measured.metrics)
             self._reached = self.seconds()
-            for observer in self.observers:
-                observer.updated(self, met)
+            self._updated(met)
 
     def _take_evaluation(self, evaluated: TrainState, measured: Arrays) -> None:
         """Takes in what the policies of these states return, and keeps the best."""

@@ -5,7 +5,7 @@ summary come out. Nothing here prints, writes a file, or reads a clock.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import summarize
 from mjx_reinforce.training import progress
 from mjx_reinforce.training.progress import BLOCKS, Progress, measure_progress, used
+
+if TYPE_CHECKING:
+    from mjx_reinforce.training.slots import Measured
 
 #: The rows of one evaluation as text: column -> the cells of all seeds; columns as in ``COLUMNS``.
 Cells = Mapping[str, Sequence[str]]
@@ -184,12 +187,119 @@ class Record:
         """Returns whether no run is to go on."""
         return self.finished()
 
+    def done(self) -> bool:
+        """Returns whether no run is to go on, and the last policies are evaluated."""
+        return self.over() and self.is_evaluated()
+
+    def add(self, blocks: Sequence["Measured"], seconds: float) -> None:
+        """Takes in evaluations and the updates after them.
+
+        Args:
+          blocks: one after the other; runs that made no update in it stay as they are.
+          seconds: wall time since the beginning.
+        """
+        raise NotImplementedError
+
+    def progress(self) -> Progress:
+        """Returns how far the runs are."""
+        raise NotImplementedError
+
     def moved(self) -> tuple[np.ndarray | None, np.ndarray | None]:
         """Returns which runs [R] move on, and about how long their episodes are [R].
 
         None stands for all: a seed of a run whose budget is used is still evaluated.
         """
         return None, None
+
+
+class Runs(NamedTuple):
+    """Runs of a sweep that move on together.
+
+    name: of these, for their files
+    place: [R] the configuration of each run, counted within its group
+    configuration: [R] the same, counted in the sweep
+    seed: [R]
+    """
+
+    name: str
+    place: np.ndarray
+    configuration: np.ndarray
+    seed: np.ndarray
+
+
+class ChunkRecord(Record):
+    """What the R runs of a chunk of a sweep have measured.
+
+    runs: which they are
+    nonfinite: [R] how many of its updates met numbers that are not finite
+    lengths: [R] the steps of all episodes of each run's latest evaluation
+    """
+
+    _kept = ("updates", "env_steps", "seconds", "nonfinite", "lengths")
+
+    def __init__(self, config: Config, runs: Runs):
+        """Begins before the first update; R is ``config.num_seeds``."""
+        super().__init__(config)
+        self.runs = runs
+        self.nonfinite = np.zeros(config.num_seeds, np.int64)
+        self.lengths = np.zeros(config.num_seeds, np.int64)
+        self._before = self.env_steps, self.seconds
+
+    def add(self, blocks: Sequence["Measured"], seconds: float) -> None:
+        """Takes in what was measured; of runs that made no update in a block, nothing."""
+        self._before, self.seconds = (self.env_steps.copy(), self.seconds), seconds
+        for runs, metrics, looked in blocks:
+            made = np.any(metrics["active"], axis=0) if metrics else np.ones(len(runs), bool)
+            self._add_evaluation(runs[made], {name: x[made] for name, x in looked.items()})
+            if metrics:
+                self._add_updates(runs, metrics)
+
+    def _add_evaluation(self, runs: np.ndarray, looked: Arrays) -> None:
+        latest = self.latest()
+        latest["eval_return"][runs] = looked["eval_return"]
+        latest["env_steps"][runs] = self.env_steps[runs]
+        self.lengths[runs] = looked["eval_steps"]
+        self._tables["evaluations"].append({name: x[None] for name, x in latest.items()})
+
+    def _add_updates(self, runs: np.ndarray, metrics: Arrays) -> None:
+        broken = (metrics["nonfinite_episodes"] > 0) | (metrics["skipped_update"] > 0)
+        self.updates[runs] += metrics["active"].sum(axis=0)
+        steps = np.where(metrics["active"], metrics["env_steps"], 0)
+        self.env_steps[runs] += steps.sum(axis=0, dtype=np.int64)
+        self.nonfinite[runs] += (broken & metrics["active"]).sum(axis=0)
+
+    def latest(self) -> Arrays:
+        """Returns ``eval_return`` of each run's latest evaluation, and ``env_steps`` until then."""
+        if not self.begun():
+            num_runs = len(self.updates)
+            return {
+                "eval_return": np.zeros(num_runs, np.float32),
+                "env_steps": np.zeros(num_runs, np.int64),
+            }
+        return {name: x[0].copy() for name, x in self._tables["evaluations"].latest(1).items()}
+
+    def curves(self) -> Arrays:
+        """Returns ``eval_return``, and ``env_steps`` until then, [E, R] each."""
+        return self._tables["evaluations"].columns()
+
+    def moved(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns which runs [R] have not used their budget, and how long their episodes are."""
+        return self.used() < 1.0, self.lengths
+
+    def share(self) -> float:
+        """Returns the part of the budgets of all runs that is used."""
+        return float(np.minimum(self.used(), 1.0).mean())
+
+    def progress(self) -> Progress:
+        """Returns how far the runs are; its fraction is ``share``."""
+        steps, seconds = self._before
+        past = {
+            "eval_return": self.latest()["eval_return"][None],
+            "env_steps": np.stack([steps, self.env_steps]),
+            "updates": self.updates[None],
+            "seconds": np.array([seconds, self.seconds]),
+        }
+        return measure_progress(past, np.array([self.share()] * 2))
 
 
 class RunRecord(Record):

@@ -29,6 +29,7 @@ from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.settings.defaults import num_cores
+from mjx_reinforce.training.memory import check_fits, check_room
 from mjx_reinforce.training.programs import Programs
 from mjx_reinforce.training.state import Budget, RunState, Seed, budget_of, shape_of_all
 
@@ -167,8 +168,8 @@ class Slot(NamedTuple):
     evaluate: (states [W, B], which [W]) -> what ``block.evaluate`` returns [W] each
     """
 
-    advance: Callable[..., tuple[jax.Array, dict[str, jax.Array], dict[str, jax.Array]]]
-    evaluate: Callable[[jax.Array, jax.Array], dict[str, jax.Array]]
+    advance: jax.stages.Compiled
+    evaluate: jax.stages.Compiled
 
 
 class Compiled(NamedTuple):
@@ -368,6 +369,9 @@ def compile_slots(
         runs of their own.
       clock: see ``Compiled``.
       meanwhile: begins other work in Python; called once the rest of the time is XLA's.
+
+    Raises:
+      ValueError: even the narrowest slot does not fit into memory.
     """
     layout = StateRows(programs.like)
     begin = started(functools.partial(_compile_begin, programs, layout, widths[0]))
@@ -376,7 +380,12 @@ def compile_slots(
     for width in widths[1:]:
         slots[width] = started(lambda width=width: _trace_slot(programs, layout, width)())
     meanwhile()
-    widest.result()
+    try:
+        widest.result()
+    except ValueError:  # it may not fit into memory
+        if len(widths) == 1:
+            raise
+        return compile_slots(programs, config, widths[1:], clock)
     return Compiled(begin.result(), slots, programs, config, clock or Stopwatch())
 
 
@@ -428,6 +437,7 @@ def _trace_slot(programs: Programs, layout: StateRows, width: int) -> Callable[[
         return programs.evaluate(states.train_states.actor, states.eval_keys, which)
 
     division = programs.division
+    check_room(2.0 * width * layout.size)
     rows, which = division.put((np.zeros((width, layout.size), np.uint8), np.zeros(width, bool)))
     nothing, no_look = division.put((Budget.of(0, 0), np.bool_(False)), NONE)
     given = rows, nothing, which, no_look
@@ -439,6 +449,8 @@ def _trace_slot(programs: Programs, layout: StateRows, width: int) -> Callable[[
 
     def wait() -> Slot:
         slot = Slot(advancing.result(), evaluating.result())
+        check_fits(slot.advance)
+        check_fits(slot.evaluate)
         # No run: a GPU's driver translates the kernels of a program when it first runs.
         jax.block_until_ready(slot.advance(*given))
         return slot

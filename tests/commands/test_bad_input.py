@@ -300,9 +300,9 @@ UNREACHABLE = {
     "train --output closed/run": "cannot write to the run directory closed/run (Permission",
     "train --output circle": "directory circle (Too many levels of symbolic links)",
     "train --output circle/run": "directory circle/run (Too many levels of symbolic links)",
-    "sweeps.command_line --over discount 1 0.9 --output closed/run": "closed/run (Permission",
+    "runs.sweep_command --over discount 1 0.9 --output closed/run": "closed/run (Permission",
     "train --resume closed/run": "closed/run/config.json (Permission denied)",
-    "sweeps.command_line --resume closed/run": "closed/run/sweep.json (Permission denied)",
+    "runs.sweep_command --resume closed/run": "closed/run/sweep.json (Permission denied)",
     "watch closed/run": "Permission denied",
     "report closed/run": "Permission denied",
     "export.__main__ closed/run": "Permission denied",
@@ -375,10 +375,12 @@ def test_the_marks_say_what_is_read(changes):
 def test_no_default_is_refused():
     """Also where a flag says what holds anyway, or another mode makes presets' settings idle."""
     for start in ([], ["gymnasium-tutorial"]):
-        default = parse(start)
-        same = parse([*start, "--discount", str(default.discount)])
+        default = parse(start).base
+        same = parse([*start, "--discount", str(default.discount)]).base
         other = "reinforce" if default.algorithm == "ars" else "ars"
-        assert (same, parse([*start, "--algorithm", other]).algorithm) == (default, other), start
+        assert (same, parse([*start, "--algorithm", other]).base.algorithm) == (default, other), (
+            start
+        )
 
 
 # What users write is printed as it is.
@@ -541,7 +543,7 @@ def test_command_lines_are_read_as_they_were_meant():
     for _, config in PRESETS.values():
         names = [name for name in changed(config, Config()) if is_read(name, config)]
         words = [word for name in names for word in as_words(name, getattr(config, name))]
-        read = parse(words)
+        read = parse(words).base
         assert {name: getattr(read, name) for name in names} == {
             name: getattr(config, name) for name in names
         }

@@ -129,7 +129,7 @@ def test_whole_numbers_are_read_as_people_write_them():
 
 def test_a_budget_with_an_exponent_is_that_budget_and_picks_its_settings():
     for arguments in (["--env-steps", "2e8"], ["--env_steps=200_000_000"]):
-        config = parse(["--env", "Ant-v5", *arguments])
+        config = parse(["--env", "Ant-v5", *arguments]).base
         assert config == of_task("Ant-v5", 200_000_000)
         assert config.num_episodes != of_task("Ant-v5", 500_000).num_episodes
 

@@ -11,9 +11,9 @@ from saved_runs import change, change_arrays, make_run, write
 from mjx_reinforce import load, report, watch
 from mjx_reinforce import train as train_module
 from mjx_reinforce.export import __main__ as export
+from mjx_reinforce.runs import sweep_command
+from mjx_reinforce.runs.design import Design, as_record
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.sweeps import command_line as sweep_command
-from mjx_reinforce.sweeps.design import Design, as_record
 from mjx_reinforce.training.resume import recordable
 
 ENV = "evil_module:Task"

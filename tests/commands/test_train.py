@@ -15,7 +15,6 @@ from command_lines import added_environments, run_command
 from toys import Survive
 
 from mjx_reinforce import load, load_policy
-from mjx_reinforce import train as train_module
 from mjx_reinforce.files import append, csv_text
 from mjx_reinforce.learning import normalize
 from mjx_reinforce.settings.config import MAX_OF_UPDATE, Config, check_step_count
@@ -144,10 +143,10 @@ def failing(run, monkeypatch):
     """Runs a command line whose training raises an error: its exit code."""
 
     def fail(error):
-        def train(*_):
+        def conduct(*_):
             raise error
 
-        monkeypatch.setattr(train_module, "train", train)
+        monkeypatch.setattr("mjx_reinforce.runs.conduct.Conductor.conduct", conduct)
         return run(*ARGUMENTS, "--output", "out")
 
     return fail

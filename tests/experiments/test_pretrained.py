@@ -74,7 +74,7 @@ def test_the_command_gives_the_settings_again():
     }
     line = shlex.split(pretrained.command(written))
     assert line[:3] == ["python", "-m", "mjx_reinforce.train"]
-    again = command_line.parse(line[3:])
+    again = command_line.parse(line[3:]).base
     assert vars(again) == vars(config) | {"standardize_floor": None, "hidden_sizes": (8, 4)}
 
 

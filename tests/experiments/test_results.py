@@ -40,7 +40,7 @@ def test_verdict_asks_whether_the_intervals_overlap(low, high, published, expect
 
 def test_the_tasks_have_settings_that_hold(tmp_path):
     for task in TASKS.values():
-        config = command_line.parse(runs.command(task, tmp_path / task.name)[3:])
+        config = command_line.parse(runs.command(task, tmp_path / task.name)[3:]).base
         assert config == dataclasses.replace(settings_of(task), output=tmp_path / task.name)
         check(config)
     (tmp_path / "config.json").write_text("{}")

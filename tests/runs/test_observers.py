@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mjx_reinforce.runs import observers
+from mjx_reinforce.runs import run_files, saving
 from mjx_reinforce.runs.display import Display
-from mjx_reinforce.runs.observers import Callbacks, RunFiles
+from mjx_reinforce.runs.run_files import Callbacks, RunFiles
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.checkpoint import Checkpoint
 
@@ -39,8 +39,10 @@ class Run:
 def watched(tmp_path, monkeypatch):
     """The files of a run that has begun, what is written, what cannot be, what it said, the run."""
     written, full, said, run = [], set(), [], Run()
-    files = RunFiles(tmp_path, {"policy": "normal"}, said.append)
-    files.begin(run, None)
+    part = SimpleNamespace(ready=SimpleNamespace(policy={"policy": "normal"}))
+    prepared = SimpleNamespace(known={}, found=None, parts=[part])
+    files = RunFiles(tmp_path, prepared, said.append)
+    files.began(run)
     assert {path.name for path in tmp_path.iterdir()} == {"config.json", "metrics.csv"}
 
     def write(name):
@@ -49,13 +51,13 @@ def watched(tmp_path, monkeypatch):
         written.append(name)
 
     for owner, name, what in (
-        (observers, "write_json", lambda path, _: path.name),
-        (observers, "save_policy", lambda folder, actor, settings: f"{actor} policies"),
-        (observers.files, "append", lambda path, _: path.name),
-        (observers.checkpoint, "save", lambda _, x, even: f"checkpoint of {x.seconds}"),
+        (saving, "write_json", lambda path, _: path.name),
+        (run_files, "save_policy", lambda folder, actor, settings: f"{actor} policies"),
+        (run_files.files, "append", lambda path, _: path.name),
+        (run_files.checkpoint, "save", lambda _, x, even: f"checkpoint of {x.seconds}"),
     ):
         monkeypatch.setattr(owner, name, lambda *x, what=what, **more: write(what(*x, **more)))
-    monkeypatch.setattr(observers, "draw", lambda driver: b"png")
+    monkeypatch.setattr(run_files, "draw", lambda driver: b"png")
     return files, written, full, said, run
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from mjx_reinforce import train as train_module
 from mjx_reinforce.runs import sinks
-from mjx_reinforce.runs.observers import RunFiles
+from mjx_reinforce.runs.run_files import RunFiles
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import iqm, iqm_interval
 from mjx_reinforce.training import record
@@ -38,8 +38,12 @@ def evaluation(update, num_seeds=20, first=False):
 
 def begin(directory, config):
     """Begins a run in a directory, or goes on without a checkpoint."""
-    run = SimpleNamespace(config=config)
-    RunFiles(directory, {}, lambda text: None).begin(run, None)
+    run = SimpleNamespace(config=config, updates=lambda: 0)
+    part = SimpleNamespace(ready=SimpleNamespace(policy={}))
+    prepared = SimpleNamespace(known={}, found=None, parts=[part])
+    files = RunFiles(directory, prepared, lambda text: None)
+    files.open()
+    files.began(run)
 
 
 @pytest.fixture
@@ -129,7 +133,7 @@ def test_what_a_kill_left_of_writing_a_file_is_removed_and_what_is_not_ours_stay
     (directory / "wandb").mkdir()
     (directory / "mine.txt").write_text("mine")
     written = [directory / name for name in ("wandb/mjx_reinforce.json", "config.json")]
-    parts = [path.with_name(f".{path.name}.0a1b") for path in written]
+    parts = [path.with_name(f".{path.name}.0a1b2c3d") for path in written]
     for config in (Config(), Config(resume=directory)):
         for part in parts:
             part.touch()

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from mjx_reinforce import envs
-from mjx_reinforce.runs import observers, run
-from mjx_reinforce.runs.begin import Begun
+from mjx_reinforce.runs import conduct, run_files
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store.ready import made
+from mjx_reinforce.training.slots import compile_run
 
 CONFIG = Config(
     env="ContinuousCartPole-v0",
@@ -25,9 +25,9 @@ CONFIG = Config(
 )
 
 
-def of(ready, config):
-    """A run with these settings, without files."""
-    return Begun(config, None, ready, None, "")
+def begin(ready, config, **more):
+    """A run with these settings, without files, before its first update."""
+    return conduct.begin_run(config, ready, compile_run(ready.programs(), config), **more)
 
 
 @pytest.fixture(scope="module")
@@ -38,35 +38,34 @@ def ready():
 @pytest.fixture(scope="module")
 def driver(ready):
     """Of a whole run, at its end."""
-    driver, seconds = run.compile_driver(of(ready, CONFIG))
-    assert seconds > ready.engine_seconds
+    driver = begin(ready, CONFIG)
     driver.drive(lambda: False)
     return driver
 
 
 def test_a_summary_says_how_the_run_ended(driver, monkeypatch):
-    summary = run.summary_of(driver, "vmap", 3.0, {"final_test_returns": [1.0, 2.0]})
+    summary = conduct.summary_of(driver, "vmap", 3.0, {"final_test_returns": [1.0, 2.0]})
     assert summary["status"] == "finished"
     assert "reason" not in summary
     assert summary["engine"] == "vmap"
     assert summary["compile_seconds"] == 3.0
     assert summary["final_test_returns"] == [1.0, 2.0]
     assert set(summary["best_updates"]) <= {0, 1, 2}
-    assert run.summary_of(driver, "vmap", 3.0, {})["status"] == "interrupted"
+    assert conduct.summary_of(driver, "vmap", 3.0, {})["status"] == "interrupted"
     monkeypatch.setattr(driver, "ended", True)  # by an observer
-    ended = run.summary_of(driver, "vmap", 3.0, {"final_test_returns": []})
+    ended = conduct.summary_of(driver, "vmap", 3.0, {"final_test_returns": []})
     assert ended["status"] == "finished"
     monkeypatch.setattr(driver.record, "hopeless", lambda: True)
-    stopped = run.summary_of(driver, "vmap", 3.0, {"final_test_returns": []})
-    assert (stopped["status"], stopped["reason"]) == ("stopped", run.HOPELESS)
+    stopped = conduct.summary_of(driver, "vmap", 3.0, {"final_test_returns": []})
+    assert (stopped["status"], stopped["reason"]) == ("stopped", conduct.HOPELESS)
 
 
 def test_a_curve_is_drawn_over_the_budget_that_the_run_has(driver, monkeypatch):
     drawn = []
-    monkeypatch.setattr(observers, "draw_learning_curve", lambda *args: drawn.append(args))
-    observers.draw(driver)
+    monkeypatch.setattr(run_files, "draw_learning_curve", lambda *args: drawn.append(args))
+    run_files.draw(driver)
     driver.config = dataclasses.replace(driver.config, env_steps=100)
-    observers.draw(driver)
+    run_files.draw(driver)
     assert [args[-1] for args in drawn] == ["episodes", "env_steps"]
     assert drawn[0][0]["eval_return"].shape == (3, 2)
     assert drawn[0][2] == CONFIG.env
@@ -74,9 +73,9 @@ def test_a_curve_is_drawn_over_the_budget_that_the_run_has(driver, monkeypatch):
 
 def test_minutes_become_env_steps_before_the_run_begins(ready, monkeypatch):
     said = []
-    monkeypatch.setattr(run, "env_steps_in", lambda seconds, *_: int(1000 * seconds))
+    monkeypatch.setattr(conduct, "env_steps_in", lambda seconds, *_: int(1000 * seconds))
     timed = dataclasses.replace(CONFIG, minutes=0.5)
-    driver, _ = run.compile_driver(of(ready, timed), said.append)
+    driver = begin(ready, timed, say=said.append)
     assert (driver.config.env_steps, driver.config.minutes) == (30_000, None)
     assert said == ["0.5 min are about 30,000 env steps of a seed in all here"]
     assert driver.config.horizon == ready.horizon
@@ -84,9 +83,9 @@ def test_minutes_become_env_steps_before_the_run_begins(ready, monkeypatch):
 
 def test_a_run_begins_with_the_policies_of_another(ready, driver, monkeypatch):
     learned = driver.states.train_states.actor
-    monkeypatch.setattr(run, "last_actors", lambda config, policy: learned)
+    monkeypatch.setattr(conduct, "last_actors", lambda config, policy: learned)
     again = dataclasses.replace(CONFIG, init_from="another run")
-    begun = run.compile_driver(of(ready, again))[0].states.train_states.actor
+    begun = begin(ready, again).states.train_states.actor
     mean = learned.normalizer.mean
     np.testing.assert_array_equal(begun.normalizer.mean, mean)
     assert mean.any()  # that of a fresh policy is 0

@@ -15,7 +15,6 @@ import pytest
 from toys import Survive
 
 from mjx_reinforce import envs
-from mjx_reinforce import train as train_module
 from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.runs import command_line
 from mjx_reinforce.settings.config import check, check_read_by_policy
@@ -55,7 +54,7 @@ def test_every_preset_makes_sense():
     for name, (line, config) in PRESETS.items():
         check(config)
         assert 20 < len(line) < 100
-        assert command_line.parse([name, "--horizon", "7"]) == dataclasses.replace(
+        assert command_line.parse([name, "--horizon", "7"]).base == dataclasses.replace(
             config, horizon=7
         )
         small = dataclasses.replace(config, num_seeds=1, horizon=7, engine="vmap")
@@ -66,7 +65,7 @@ def test_every_preset_makes_sense():
 
 
 def test_no_preset_is_the_default():
-    assert command_line.parse([]) == of_task("InvertedPendulum-v5")
+    assert command_line.parse([]).base == of_task("InvertedPendulum-v5")
 
 
 @pytest.mark.parametrize(
@@ -122,7 +121,8 @@ def test_help_lists_presets_and_groups_without_jax():
 def test_defaults_that_a_policy_does_not_read_are_not_the_users(id, words):
     """Only what the command line itself says may be refused for doing nothing."""
     arguments = ["--env", id, *words]
-    config, default = command_line.parse(arguments), train_module.start(arguments, "train")[0]
+    design = command_line.parse(arguments)
+    config, default = design.base, design.default
     families = {"ars": "deterministic", "reinforce": "normal"}
     family = "categorical" if id.startswith("CartPole") else families[config.algorithm]
     check_read_by_policy(config, default, family)

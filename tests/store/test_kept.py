@@ -58,7 +58,7 @@ def numbers(prepared, config):
 
     How much was simulated is left out: threads share the episodes, whichever is first.
     """
-    slots, measured = compile_run(prepared.programs, config), []
+    slots, measured = compile_run(prepared.programs(), config), []
     for _ in range(2):
         [(_, metrics, looked)] = slots.advance()
         measured += [metrics, looked, slots.evaluate().looked]
@@ -81,9 +81,12 @@ def test_a_second_start_traces_nothing_and_gives_the_same(monkeypatch):
         patch.setattr(envs, "make", lambda *_: pytest.fail("the environment was built"))
         second = ready.get_ready(config, config)
         assert second.engine_seconds == 0
-        assert jax.tree.structure(second.programs.like) == jax.tree.structure(plain.programs.like)
+        assert jax.tree.structure(second.programs().like) == jax.tree.structure(
+            plain.programs().like
+        )
         shapes = [
-            [(x.shape, x.dtype) for x in jax.tree.leaves(y.programs.like)] for y in (second, plain)
+            [(x.shape, x.dtype) for x in jax.tree.leaves(y.programs().like)]
+            for y in (second, plain)
         ]
         assert shapes[0] == shapes[1]
         for prepared in (first, second):
@@ -198,7 +201,7 @@ def test_programs_need_no_code_of_others(folder, monkeypatch):
     own = seam.targets
     monkeypatch.setattr(seam, "targets", lambda: [*own(), "mjx_reinforce_" + 64 * "0"])
     prepared = ready.get_ready(CONFIG, CONFIG)
-    compile_run(prepared.programs, CONFIG)
+    compile_run(prepared.programs(), CONFIG)
     assert kept.read_programs(kept.key_of(CONFIG)) is not None
 
 
@@ -299,7 +302,7 @@ if sys.argv[1] == "second":
     envs.make = None
 config = Config(env="InvertedPendulum-v5", num_seeds=2, num_episodes=2, eval_episodes=2)
 prepared = ready.get_ready(config, config)
-[(_, metrics, looked)] = compile_run(prepared.programs, config).advance()
+[(_, metrics, looked)] = compile_run(prepared.programs(), config).advance()
 print(prepared.engine, metrics["episode_return"].tolist(), looked["eval_return"])
 print("mujoco" in sys.modules)
 """

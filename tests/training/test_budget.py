@@ -11,7 +11,7 @@ import pytest
 
 from experiments.kit.trainings import results
 from mjx_reinforce.learning import counts
-from mjx_reinforce.runs import run as from_python
+from mjx_reinforce.runs import conduct
 from mjx_reinforce.runs.command_line import parse
 from mjx_reinforce.settings import defaults, tables
 from mjx_reinforce.settings.config import MAX_COUNT, Config, check
@@ -68,7 +68,7 @@ def test_a_default_run_has_the_budget_of_its_machine(monkeypatch, gpu):
         assert config.env_steps == tables.MINUTES.get(env, (Config.env_steps,) * 2)[gpu]
         # More seeds than a default run has leave each with what it would learn.
         assert of_task(env, num_seeds=1000) == dataclasses.replace(config, num_seeds=1000)
-        assert parse(["--env", env]) == config
+        assert parse(["--env", env]).base == config
         if gpu and env in tables.OF_BUDGETS:
             assert config.num_episodes >= 128
         assert of_task(env, minutes=2.0).env_steps == 2 * config.env_steps
@@ -88,8 +88,8 @@ def test_a_budget_chooses_the_settings():
     assert medium.eval_every == 5 * 10**7 // 50 // (16 * 250)
     for config in (few, some, many):
         words = ["--env", "Hopper-v5", "--env-steps", str(config.env_steps)]
-        assert parse(words) == config
-    assert parse(["--env=Hopper-v5", "--env-steps=1000000", "--num-seeds=9"]).num_seeds == 9
+        assert parse(words).base == config
+    assert parse(["--env=Hopper-v5", "--env-steps=1000000", "--num-seeds=9"]).base.num_seeds == 9
 
 
 # A budget in time: the env steps that a machine trains in it, from the speed at the start.
@@ -131,8 +131,8 @@ class Machine:
     ],
 )
 def test_what_is_trained_in_a_time(monkeypatch, seconds, machine, config, expected):
-    monkeypatch.setattr(from_python.time, "perf_counter", lambda: machine.now)
-    assert from_python.env_steps_in(seconds, machine, config) == expected
+    monkeypatch.setattr(conduct.time, "perf_counter", lambda: machine.now)
+    assert conduct.env_steps_in(seconds, machine, config) == expected
 
 
 # How much of a budget is used, and when a checkpoint is due.

@@ -20,9 +20,9 @@ from saved_runs import assert_same, change
 from mjx_reinforce import files
 from mjx_reinforce import files as export_files
 from mjx_reinforce.engine.cpu import machine
-from mjx_reinforce.runs import begin
+from mjx_reinforce.runs import plan
 from mjx_reinforce.runs.directory import locked, make_directory
-from mjx_reinforce.runs.observers import RunFiles
+from mjx_reinforce.runs.run_files import RunFiles
 from mjx_reinforce.training import checkpoint
 from mjx_reinforce.training.record import RunRecord
 from mjx_reinforce.training.slots import Slots
@@ -153,7 +153,7 @@ def test_a_run_that_cannot_end_is_resumed(run, trained, tmp_path, monkeypatch, c
     def full(path, content, compressed):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("mjx_reinforce.runs.observers.write_arrays", full)
+    monkeypatch.setattr("mjx_reinforce.runs.run_files.write_arrays", full)
     arguments = ["--max-updates", 20, "--checkpoint-every", 5, "--output", "full"]
     assert run(*COMMON, *arguments) == 1
     assert "then go on with --resume full" in capsys.readouterr().err
@@ -183,7 +183,7 @@ def signalled(method, when):
 @pytest.mark.parametrize(
     ("owner", "name", "when", "status", "rows"),
     [
-        (RunFiles, "begin", 1, 143, 1),
+        (RunFiles, "began", 1, 143, 1),
         (Slots, "advance", 2, 143, 2),  # whose evaluation is left to the run that goes on
         (RunRecord, "add_test", 1, 143, 5),
         (RunRecord, "add_test", 2, 0, 5),  # nothing is left to stop
@@ -211,7 +211,7 @@ def test_a_full_disk_is_refused_at_once(run, parts, tmp_path, monkeypatch, capsy
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     arguments = ["--resume", "parts"] if resumed else [*COMMON, "--output", "new/out"]
     before = sorted(tmp_path.rglob("*"))
-    monkeypatch.setattr(begin, "make_plan", pytest.fail)
+    monkeypatch.setattr(plan, "prepare", pytest.fail)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:
         code = run(*arguments, "--max-updates", 30)

@@ -40,11 +40,11 @@ def test_they_have_run_once_without_an_update(prepared):
     made = []
 
     def advance(*arguments):
-        state, block = prepared.programs.advance(*arguments)
+        state, block = prepared.programs().advance(*arguments)
         jax.debug.callback(lambda x: made.append(int(x)), block.made)
         return state, block
 
-    slots = compile_run(prepared.programs._replace(advance=advance), CONFIG)
+    slots = compile_run(prepared.programs()._replace(advance=advance), CONFIG)
     jax.effects_barrier()
     assert made == [0]
     assert not slots.states().train_states.env_steps.any()
@@ -57,8 +57,8 @@ def test_they_have_run_once_without_an_update(prepared):
 def test_evaluations_ride_with_the_updates_that_follow(prepared):
     """They measure the policies before these, and leave what is trained as it is, to the bit."""
     assert prepared.engine == "native"
-    assert prepared.programs.rides
-    slots = compile_run(prepared.programs, CONFIG)
+    assert prepared.programs().rides
+    slots = compile_run(prepared.programs(), CONFIG)
     first, alone = slots.states(), slots.evaluate().looked
     [(_, metrics, looked)], one = slots.advance(), slots.states()
     slots.restore(first)
@@ -75,7 +75,7 @@ def test_evaluations_ride_with_the_updates_that_follow(prepared):
 def test_a_seed_begins_alike_whichever_begin_with_it():
     """So do the seeds that a process has, and those of a slot."""
     config = dataclasses.replace(LUCK, num_seeds=4, test_episodes=6)
-    begin = jax.jit(ready.made(Luck(), config).programs.begin)
+    begin = jax.jit(ready.made(Luck(), config).programs().begin)
     every, all_keys = plain(begin(3, np.arange(4, dtype=np.uint32), {}))
     some, keys = plain(begin(3, np.array([2, 0], np.uint32), {}))
     jax.tree.map(lambda x, y: np.testing.assert_array_equal(x, y[jnp.array([2, 0])]), some, every)
@@ -100,7 +100,7 @@ LUCK = Config(env="Luck-v0", num_seeds=3, hidden_sizes=(), eval_episodes=2, test
 def measure(**changes):
     """Returns what settings evaluate to before and after an update, and what they test to."""
     config = dataclasses.replace(LUCK, **changes)
-    slots = compile_run(ready.made(Luck(), config).programs, config)
+    slots = compile_run(ready.made(Luck(), config).programs(), config)
     [first], later = slots.advance(), slots.evaluate()
     return first.looked, later.looked, slots.test(slots.states().train_states.actor)
 
@@ -135,8 +135,8 @@ def test_training_is_cut_for_a_share_of_the_budget_and_evaluations_never(share):
     )
     prepared = ready.made(envs.make(config.env), config)
     assert prepared.horizon == 500
-    assert prepared.programs.rides == (share < 1)
-    slots, steps, cut, whole = compile_run(prepared.programs, config), 0, [], []
+    assert prepared.programs().rides == (share < 1)
+    slots, steps, cut, whole = compile_run(prepared.programs(), config), 0, [], []
     while steps < config.env_steps:
         [(_, metrics, looked)] = slots.advance()
         lengths = cut if steps < share * config.env_steps else whole
@@ -153,4 +153,4 @@ def test_a_cut_after_the_time_limit_is_none():
     config = dataclasses.replace(CONFIG, horizon=20, train_horizon=100)
     prepared = ready.made(envs.make(CONFIG.env), config)
     assert prepared.horizon == 20
-    assert prepared.programs.rides
+    assert prepared.programs().rides

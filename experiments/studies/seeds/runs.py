@@ -15,10 +15,11 @@ from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.files import read_arrays, read_json, write_arrays
 from mjx_reinforce.learning.policy import MLP
+from mjx_reinforce.runs.design import Design, read_design
+from mjx_reinforce.runs.perform import perform
+from mjx_reinforce.runs.sweep_command import report_on
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics.survival import time_to_threshold
-from mjx_reinforce.sweeps.design import Design, read_design
-from mjx_reinforce.sweeps.perform import perform
 
 #: Root of all randomness of the study; no figure elsewhere in this repository uses it.
 SEED = 20_261_122
@@ -130,14 +131,13 @@ def train(base: Config, directory: Path) -> bool:
     configure_jax()
     if envs.make(base.env).reward_threshold is None:
         raise ValueError(f"{base.env} names no return at which it is solved; choose another task")
-    begun = (directory / "sweep.json").exists()
-    if begun:
-        design = dataclasses.replace(read_design(directory), resume=directory)
+    if (directory / "sweep.json").exists():
+        design = read_design(directory)
     else:
         over = dict(_SETTINGS.get(name, (name, values)) for name, values in FACTORS.items())
         design = Design(base=dataclasses.replace(base, output=directory), over=over)
     with Interrupt() as interrupt:
-        perform(design, interrupt)
+        report_on(perform(design, interrupt))
         ended = interrupt.number is None
     if ended:
         save(measure(directory), directory)

@@ -23,15 +23,16 @@ from mjx_reinforce import train as train_module
 from mjx_reinforce.export.player import load_seed
 from mjx_reinforce.export.run_files import choose_seed, read_run
 from mjx_reinforce.report import WrittenReport
+from mjx_reinforce.runs import conduct, plan, sweep_command
+from mjx_reinforce.runs.design import Design, check_design, configure, grid, read_design
+from mjx_reinforce.runs.plan import make_groups
+from mjx_reinforce.runs.results import read_results
+from mjx_reinforce.runs.sweep_files import SweepFiles, join_parts
 from mjx_reinforce.settings.config import Config, check
+from mjx_reinforce.store import ready
 from mjx_reinforce.store.build import build
-from mjx_reinforce.sweeps import chunks, conduct, perform, plan
-from mjx_reinforce.sweeps import command_line as sweep_command
-from mjx_reinforce.sweeps.design import Design, check_design, configure, grid, read_design
-from mjx_reinforce.sweeps.perform import read_results
-from mjx_reinforce.sweeps.plan import learner_builder, make_groups
-from mjx_reinforce.sweeps.results import join_parts
-from mjx_reinforce.training import driver, slots
+from mjx_reinforce.training import checkpoint, driver, slots
+from mjx_reinforce.training.division import ALONE
 from mjx_reinforce.training.programs import programs_of
 from mjx_reinforce.training.state import eval_keys
 
@@ -47,7 +48,7 @@ RATES = "--over learning-rate 1e-2 3e-2 1e-1"
 @pytest.fixture
 def run(run, monkeypatch):
     """Runs a sweep of arguments in one string; the report has tests of its own."""
-    monkeypatch.setattr(perform, "_report", lambda directory: WrittenReport(0.0, [], 0))
+    monkeypatch.setattr(sweep_command, "_report", lambda directory: WrittenReport(0.0, [], 0))
     return lambda line, command=sweep_command: run(*line.split(), command=command)
 
 
@@ -149,7 +150,7 @@ def test_an_exact_run_does_not_depend_on_the_others(run):
 
 
 @pytest.mark.slow
-def test_numbers_of_shifts_dampings_and_values_are_traced():
+def test_numbers_of_shifts_dampings_and_values_are_traced(monkeypatch):
     """As arguments of one program, side by side, they do what they do alone."""
     base = dataclasses.replace(
         Config(env="Drift-v0"),
@@ -171,7 +172,9 @@ def test_numbers_of_shifts_dampings_and_values_are_traced():
     assert {"entropy_cost", "standardize_floor", "max_kl", "value_learning_rate"} <= {
         *group.settings
     }
-    builder, key = learner_builder(Drift(), group.config), jax.random.key(3)
+    key = jax.random.key(3)
+    monkeypatch.setattr(ready, "programs_of", lambda env, build, *more, **options: build)
+    builder = ready.made(Drift(), group.config, ALONE, tuple(group.settings)).programs()
 
     def trained(learner):
         states = jax.lax.scan(lambda x, _: (learner.step(x)[0], None), learner.init(key), None, 2)
@@ -201,7 +204,7 @@ def whole(tmp_path_factory):
     """A sweep of chunks that nothing stopped."""
     directory = tmp_path_factory.mktemp("sweep")
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(directory), added_environments():
-        patch.setattr(perform, "_report", lambda directory: WrittenReport(0.0, [], 0))
+        patch.setattr(sweep_command, "_report", lambda directory: WrittenReport(0.0, [], 0))
         patch.setattr(plan, "_CPU_EPISODES", (16, 4))
         assert run_command(*CHUNKS.split(), "--output", "whole", command=sweep_command) == 0
     return directory / "whole"
@@ -274,16 +277,16 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
     What ended is not trained again, and its report is written if it is not there.
     """
     monkeypatch.setattr(plan, "_CPU_EPISODES", (16, 4))
-    drive, driven, ended, tried = chunks.drive, [], [], []
-    add, save, write = conduct.SweepFiles.add, conduct.Chunk.save, chunks.checkpoint.save
+    drive, driven, ended, tried = driver.drive, [], [], []
+    add, save, write = SweepFiles._add, SweepFiles._save_checkpoint, checkpoint.save
 
     def interrupted(*arguments):
         driven.append(None)
         return drive(*arguments) if len(driven) == 1 else iter(())
 
-    def crash_among_ended(self):
-        save(self)
-        ended.append((self.record.env_steps >= 300).sum())
+    def crash_among_ended(self, driver):
+        save(self, driver)
+        ended.append((driver.record.env_steps >= 300).sum())
         if 0 < ended[-1] < 4:
             raise CrashError
 
@@ -298,22 +301,19 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
         write(*arguments, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(chunks, "drive", interrupted)
+        patch.setattr(driver, "drive", interrupted)
         assert run(f"{CHUNKS} --output parts") == 0
     assert json.loads(Path("parts/sweep.json").read_text())["status"] == "interrupted"
-    for owner, name, crash in (
-        (conduct.Chunk, "save", crash_among_ended),
-        (conduct.SweepFiles, "add", crash_after_chunk),
-    ):
+    for name, crash in (("_save_checkpoint", crash_among_ended), ("_add", crash_after_chunk)):
         with monkeypatch.context() as patch:
-            patch.setattr(owner, name, crash)
+            patch.setattr(SweepFiles, name, crash)
             with pytest.raises(CrashError):
                 run("--resume parts")
     assert 0 < ended[-1] < 4
     assert json.loads(Path("parts/sweep.json").read_text())["status"] == "running"
     assert len(list(Path("parts/parts").glob("[0-9]*.npz"))) == 2
     capsys.readouterr()
-    monkeypatch.setattr(chunks.checkpoint, "save", full)
+    monkeypatch.setattr(checkpoint, "save", full)
     assert run("--resume parts") == 0
     assert len(tried) > 4
     said = capsys.readouterr().out
@@ -321,13 +321,15 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
     assert same(curves(whole), curves(Path("parts")))
     assert (whole / "results.csv").read_bytes() == Path("parts/results.csv").read_bytes()
     reported, written = [], WrittenReport(1.0, [], 0)
-    monkeypatch.setattr(perform, "_report", lambda directory: reported.append(directory) or written)
-    assert run("--resume parts") == 0  # there is nothing left to do
-    assert reported == []
-    path = Path("parts/sweep.json")
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"statistics_seconds": None}))
+    monkeypatch.setattr(
+        sweep_command, "_report", lambda directory: reported.append(directory) or written
+    )
     assert run("--resume parts") == 0  # killed before the report was written
     assert reported == [Path("parts")]
+    Path("parts/report.html").touch()
+    assert run("--resume parts") == 0  # there is nothing left to do
+    assert reported == [Path("parts")]
+    assert (whole / "results.csv").read_bytes() == Path("parts/results.csv").read_bytes()
     assert run("--resume parts --learning-rate 0.5") == 2
 
 
@@ -336,15 +338,15 @@ def test_a_chunk_that_goes_on_saves_when_it_is_due(run, monkeypatch):
     """Not at its first look: the checkpoint that it was found in counts."""
     monkeypatch.setattr(driver, "_SECONDS", 0.0)
     command = f"{SMALL} --num-seeds 2 --eval-every 1 --checkpoint-every 2 {RATES}"
-    save, saved = conduct.Chunk.save, []
+    save, saved = SweepFiles._save_checkpoint, []
 
-    def crash(self):
-        save(self)
-        saved.append(int(self.record.updates.max()))
+    def crash(self, driver):
+        save(self, driver)
+        saved.append(driver.updates())
         if saved == [2]:
             raise CrashError
 
-    monkeypatch.setattr(conduct.Chunk, "save", crash)
+    monkeypatch.setattr(SweepFiles, "_save_checkpoint", crash)
     with pytest.raises(CrashError):
         run(f"{command} --max-updates 5 --output crashed")
     assert run("--resume crashed") == 0
@@ -378,7 +380,7 @@ def test_a_sweep_whose_first_file_cannot_be_written_was_not_begun(run, monkeypat
 
     command = f"{STEPS} --num-seeds 2 --output out"
     with monkeypatch.context() as patch:
-        patch.setattr("mjx_reinforce.sweeps.results.write_json", full)
+        patch.setattr("mjx_reinforce.runs.saving.write_json", full)
         assert run(command) == 1
     Path("out").mkdir(exist_ok=True)
     (Path("out") / ".sweep.json.12ab").write_text("half")
@@ -395,7 +397,7 @@ def test_what_a_kill_left_of_a_report_goes(tmp_path, monkeypatch):
         path.write_text("half")
     nothing = WrittenReport(0.0, [], 0)
     monkeypatch.setattr("mjx_reinforce.report.write_report", lambda chosen, output: nothing)
-    assert perform._report(tmp_path) == nothing
+    assert sweep_command._report(tmp_path) == nothing
     assert not any(path.exists() for path in left)
 
 
@@ -478,16 +480,14 @@ def test_a_flag_that_one_configuration_reads_is_accepted():
 @pytest.mark.slow
 def test_from_python_it_is_reported_on(register, monkeypatch, tmp_path, capsys):
     written = WrittenReport(1.5, ["The best is learning rate 0.03.", "It is sure."], 1)
-    monkeypatch.setattr(perform, "_report", lambda directory: written)
+    monkeypatch.setattr(sweep_command, "_report", lambda directory: written)
     base = Config(
         env="Drift-v0", num_seeds=2, num_episodes=4, eval_episodes=2, env_steps=None, max_updates=2
     )
     results = mjx_reinforce.sweep(base, {"learning_rate": [1e-2, 3e-2]}, output=tmp_path / "out")
     assert results.eval_return.shape[1] == 4
-    known = json.loads((tmp_path / "out" / "sweep.json").read_text())
-    assert known["statistics_seconds"] == 1.5
     said = capsys.readouterr().out
-    assert "statistics and report" in said
+    assert "statistics and report 1.5 s" in said
     assert "The best is learning rate 0.03.\nIt is sure.\n" in said
     assert f"mjx_reinforce.watch {tmp_path}/out/policies/001\n" in said
     assert (tmp_path / "out/policies/001/config.json").is_file()
@@ -540,8 +540,7 @@ def test_each_setting_of_an_environment_has_its_own_program_and_policies(tmp_pat
     over = {"env_set.sutton_barto_reward": ["false", "true"]}
     found = mjx_reinforce.sweep(base, over, output=tmp_path / "out", report=False, quiet=True)
     assert capsys.readouterr().out == ""
-    known = json.loads((tmp_path / "out" / "sweep.json").read_text())
-    assert known["statistics_seconds"] is None  # nothing is reported on
+    assert not (tmp_path / "out" / "report.html").exists()
     last = found.eval_return[-1]
     assert np.all(last[found.configuration == 0] > 5)
     assert np.all(last[found.configuration == 1] <= 0)
@@ -549,7 +548,10 @@ def test_each_setting_of_an_environment_has_its_own_program_and_policies(tmp_pat
     assert run.env_set == ("max_episode_steps=9", "sutton_barto_reward=true")
     assert run.horizon == 9
     resumed = read_design(tmp_path / "out")
-    assert (resumed.base, resumed.over) == (base, over)
+    assert (resumed.base, resumed.over) == (
+        dataclasses.replace(base, resume=tmp_path / "out"),
+        over,
+    )
 
 
 @pytest.mark.slow

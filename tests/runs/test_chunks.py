@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.sweeps.chunks import ChunkRecord
+from mjx_reinforce.training.record import ChunkRecord, Runs
 from mjx_reinforce.training.slots import Measured
 
 CONFIG = Config(num_seeds=4, env_steps=100, max_updates=10)
+RUNS = Runs("000-0000", np.zeros(4, int), np.zeros(4, int), np.arange(4))
 
 
 def measured(runs, returns, lengths, active=(), env_steps=(), broken=()):
@@ -19,7 +20,7 @@ def measured(runs, returns, lengths, active=(), env_steps=(), broken=()):
 
 
 def filled():
-    record = ChunkRecord(CONFIG)
+    record = ChunkRecord(CONFIG, RUNS)
     record.add([measured([2, 0, 1, 3], [3.0, 1, 2, 4], [30, 10, 20, 40])], 0.5)
     one = measured([3, 1], [7, 8], [5, 6], [[1, 1], [1, 1]], [[70, 20], [60, 30]], [[1, 0], [0, 0]])
     # In the second block the budget of run 3 is used.
@@ -57,7 +58,7 @@ def test_the_share_is_the_mean_of_all_budgets():
 
 
 def test_a_record_is_restored():
-    record, copy = filled(), ChunkRecord(CONFIG)
+    record, copy = filled(), ChunkRecord(CONFIG, RUNS)
     assert not copy.is_evaluated()
     copy.restore({name: x.copy() for name, x in record.arrays().items()})
     for each in (record, copy):

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from mjx_reinforce.runs import design, plan
+from mjx_reinforce.runs.design import Design
+from mjx_reinforce.runs.plan import Group, describe, make_groups, prepare
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.sweeps import chunks, design, plan
-from mjx_reinforce.sweeps.design import Design
-from mjx_reinforce.sweeps.plan import Group, make_groups, prepare_sweep
 
 CONFIG = Config(env_steps=1000, max_updates=7, num_seeds=3, num_episodes=16)
 
@@ -74,7 +74,7 @@ def test_slots_are_no_wider_than_the_chunk(monkeypatch):
 @pytest.mark.parametrize("num_chunks", [1, 2, 4, 15])
 def test_every_run_is_in_one_chunk_and_every_chunk_has_its_share(num_chunks):
     whole = group((3, 5, 8, 9, 11))
-    parts = chunks.split_runs(whole, "0", num_chunks)
+    parts = plan.split_runs(whole, "0", num_chunks)
     assert len(parts) == num_chunks
     runs = [(c, s) for part in parts for c, s in zip(part.configuration, part.seed, strict=True)]
     assert sorted(runs) == [(c, s) for c in (3, 5, 8, 9, 11) for s in range(3)]
@@ -123,8 +123,8 @@ BASE = Config(
 OVER = {"num_episodes": [2, 4], "learning_rate": [1e-3, 1e-2, 1e-1]}
 
 
-def prepared(limits=None, **changes):
-    return prepare_sweep(Design(base=BASE, over=OVER, **changes), limits)
+def prepared(base=BASE, **changes):
+    return prepare(Design(base=base, over=OVER, **changes), None, pytest.fail)
 
 
 def test_a_group_is_what_shares_its_programs():
@@ -133,15 +133,20 @@ def test_a_group_is_what_shares_its_programs():
     assert [group.members.tolist() for group in groups] == [[0, 1, 2], [3, 4, 5]]
     assert [group.config.num_episodes for group in groups] == [2, 4]
     assert groups[1].settings["learning_rate"].tolist() == [1e-3, 1e-2, 1e-1]
-    assert len(sweep.configurations) == 6
-    assert [part.horizon for part in sweep.parts] == [50, 50]
-    assert sweep.engine == "vmap"
-    assert "18 runs" in sweep.plan
+    assert [part.ready.horizon for part in sweep.parts] == [50, 50]
+    assert describe(sweep).startswith("Training 6 configurations of 3 seeds, 18 runs of Continuous")
 
 
-def test_a_chunk_has_as_many_runs_as_asked_or_as_it_had():
+def test_a_chunk_has_as_many_runs_as_asked_or_as_it_had(monkeypatch, tmp_path):
     assert [part.limit for part in prepared(chunk_runs=4).parts] == [4, 4]
-    assert [part.limit for part in prepared([2, 9], chunk_runs=4).parts] == [2, 9]
+    known = {"chunk_runs": [2, 9], "local_devices": 1}
+    monkeypatch.setattr(plan.resume, "read_record", lambda directory, name: known)
+    monkeypatch.setattr(plan.resume, "check_same_program", lambda *given: None)
+    base = dataclasses.replace(BASE, resume=tmp_path)
+    assert [part.limit for part in prepared(base, chunk_runs=4).parts] == [2, 9]
+    known["local_devices"] = 3
+    with pytest.raises(ValueError, match="was begun on 3 devices, and here are 1"):
+        prepared(base)
 
 
 def test_exact_sweeps_have_one_device_and_trace_every_number():
@@ -153,4 +158,4 @@ def test_exact_sweeps_have_one_device_and_trace_every_number():
 def test_a_task_that_refuses_its_settings():
     wrong = Config(env="ContinuousCartPole-v0", env_set=("no_such=1",), env_steps=10)
     with pytest.raises(ValueError, match="no_such"):
-        prepare_sweep(Design(base=wrong, over=OVER), None)
+        prepared(wrong)

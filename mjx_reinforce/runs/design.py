@@ -1,4 +1,4 @@
-"""What a sweep is to do: the settings of all runs, and the grid of values that it goes over."""
+"""What a run or a sweep is to do: the settings of all runs, and the grid that it goes over."""
 
 import contextlib
 import dataclasses
@@ -14,15 +14,19 @@ import tyro
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.engine.checks import alternatives, check_name, nearest, read_as
 from mjx_reinforce.engine.memory import gigabytes, host_memory
-from mjx_reinforce.runs.plan import check_memory
+from mjx_reinforce.runs.sinks import check_installed
 from mjx_reinforce.settings.config import (
+    MAX_OF_UPDATE,
     Config,
+    changed,
     check,
     check_each,
     check_read,
     flag,
+    marked,
     spoken,
 )
+from mjx_reinforce.settings.declare import Range
 from mjx_reinforce.settings.groups import LogSettings
 from mjx_reinforce.training.resume import PLACES, as_config, read_record
 
@@ -46,22 +50,36 @@ class SweepSettings:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Design:
-    """A sweep, its values read.
+    """A run, or a sweep, its values read.
 
     base: the settings of all runs but those that are swept, and where its directory is
-    over: the values of each setting that is swept
-    given: other settings that the user chose; at least one configuration must read each
+    over: the values of each setting that is swept; nothing of a run, which is one configuration
+    default: the settings that hold where the user gave none; at least one configuration must read
+      each that differs. None where nobody chose
     exact: see ``SweepSettings``
     chunk_runs: see ``SweepSettings``
-    resume: the directory of a sweep that goes on
     """
 
     base: Config
-    over: Mapping[str, Sequence[Any]]
-    given: Sequence[str] = ()
+    over: Mapping[str, Sequence[Any]] = dataclasses.field(default_factory=dict)
+    default: Config | None = None
     exact: bool = False
     chunk_runs: int | None = None
-    resume: Path | None = None
+
+    @property
+    def given(self) -> tuple[str, ...]:
+        """The settings that the user chose."""
+        return () if self.default is None else changed(self.base, self.default)
+
+    @property
+    def resume(self) -> Path | None:
+        """The directory in which it goes on, if it does."""
+        return self.base.resume
+
+    @property
+    def first_file(self) -> str:
+        """The name of the file with which its directory begins."""
+        return "sweep.json" if self.over else "config.json"
 
     def count(self) -> int:
         """Returns how many configurations it has."""
@@ -93,14 +111,19 @@ def read_design(directory: Path) -> Design:
             name: [tuple(x) if isinstance(x, list) else x for x in values]
             for name, values in record["over"].items()
         }
-        base = as_config(record["settings"], path)
+        base = dataclasses.replace(as_config(record["settings"], path), resume=directory)
         return Design(base=base, over=over, exact=record["exact"])
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path} is damaged: {error!r}") from error
 
 
 def check_design(design: Design) -> None:
-    """Raises ValueError for a sweep that makes no sense, before anything heavy is imported."""
+    """Raises ValueError for what makes no sense, before anything heavy is imported."""
+    if not design.over:
+        check(design.base)
+        _check_counts(design.base)
+        check_installed(design.base)
+        return
     check_each(design.base)
     for name in ("minutes", "init_from"):
         if getattr(design.base, name) is not None:
@@ -109,9 +132,18 @@ def check_design(design: Design) -> None:
         raise ValueError(f"--chunk-runs must be at least 1, got {design.chunk_runs}")
     check_over(design.base, design.over)
     _check_results(design)
-    configs = configure(design.base, design.configurations(), design.given)
-    for config in configs:
-        check_memory(dataclasses.replace(config, num_seeds=1))
+    for config in configure(design.base, design.configurations(), design.given):
+        _check_counts(config)
+
+
+def _check_counts(config: Config) -> None:
+    """Raises ValueError for numbers of things that no memory holds."""
+    large = (*marked(Range.COUNTED), *marked(Range.SEED))
+    for name, value in vars(config).items():
+        numbers = value if isinstance(value, tuple) else (value,)
+        most = max((x for x in numbers if isinstance(x, int)), default=0)
+        if name not in large and most > MAX_OF_UPDATE:
+            raise ValueError(f"{flag(name)} must be less than 2^31, got {most}")
 
 
 def _check_results(design: Design) -> None:
@@ -176,6 +208,15 @@ def grid(over: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
     return [dict(zip(over, values, strict=True)) for values in itertools.product(*over.values())]
 
 
+def check_swept(over: Mapping[str, Sequence[Any]]) -> None:
+    """Raises ValueError where a sweep goes over nothing."""
+    if not over:
+        raise ValueError(
+            f"nothing is swept: give --over a setting and its values, {_EXAMPLE}, or train one "
+            f"configuration by {command('train')}"
+        )
+
+
 def check_over(base: Config, over: Mapping[str, Sequence[Any]]) -> None:
     """Raises ValueError for settings that cannot be swept, or values that make no choice."""
     for field in dataclasses.fields(LogSettings):
@@ -183,11 +224,6 @@ def check_over(base: Config, over: Mapping[str, Sequence[Any]]) -> None:
             raise ValueError(
                 f"{flag(field.name)} logs a run; leave it out: a sweep writes results.csv"
             )
-    if not over:
-        raise ValueError(
-            f"nothing is swept: give --over a setting and its values, {_EXAMPLE}, or train one "
-            f"configuration by {command('train')}"
-        )
     for name, values in over.items():
         if own := _of_env(name):
             why = _ENV_ONCE.get(own)

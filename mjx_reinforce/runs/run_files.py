@@ -9,76 +9,57 @@ from typing import Any
 
 from mjx_reinforce import files
 from mjx_reinforce.export.policy_files import save_policy
-from mjx_reinforce.files import Arrays, write_arrays, write_bytes, write_json
+from mjx_reinforce.files import write_arrays, write_bytes
 from mjx_reinforce.reports.curves import draw_learning_curve
-from mjx_reinforce.runs import sinks
+from mjx_reinforce.runs.plan import Prepared
+from mjx_reinforce.runs.saving import Files
 from mjx_reinforce.runs.sinks import Sink, open_sinks
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store.provenance import provenance
 from mjx_reinforce.training import checkpoint, resume
-from mjx_reinforce.training.checkpoint import Attempts, Checkpoint, SaveDue
+from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer
 from mjx_reinforce.training.record import HEADER, Cells, lines
 
-#: The files of a run, besides those in ``checkpoint/``.
-_POLICY = ("policy/actor.npz", "policy/policy.json")
-_BEST = ("policy/best/actor.npz", "policy/best/policy.json")
-_RESULTS = ("summary.json", "learning_curve.png", "returns.npz")
-_FILES = ("config.json", "metrics.csv", *_RESULTS, *_POLICY, *_BEST)
 
+class RunFiles(Files[Driver]):
+    """Writes the files of a run into its directory, and the rows of its sinks."""
 
-class RunFiles(Observer):
-    """Writes the files of a run into its directory, and the rows of its sinks.
+    _folders = ("policy", "policy/best", "wandb")
 
-    A file that cannot be written while the run goes on is a warning, and is tried again.
-    """
-
-    def __init__(self, directory: Path, policy: dict[str, Any], say: Callable[[str], None]):
+    def __init__(self, directory: Path, prepared: Prepared, say: Callable[[str], None]):
         """Takes the files of a run, before they are there.
 
         Args:
           directory: where they are.
-          policy: how to rebuild the run's policy, see ``policy_files.save_policy``.
+          prepared: what the run is made of.
           say: shows a line to the user.
         """
-        self._directory, self._policy, self._say = directory, policy, say
+        super().__init__(directory, dict(prepared.known), say)
+        self._found, self._policy = prepared.found, prepared.parts[0].ready.policy
         self._metrics, self._checkpoints = directory / "metrics.csv", directory / "checkpoint"
         #: Rows that could not be written yet.
         self._waiting = b""
-        self._attempt = Attempts(say).attempt
-        self._due = SaveDue(None)
-        #: Whether the newest checkpoint is of the present state.
-        self._saved = False
         #: Where rows go besides metrics.csv.
         self._sinks: list[Sink] = []
 
-    def begin(self, driver: Driver, found: Checkpoint | None) -> None:
+    def began(self, driver: Driver) -> None:
         """Writes the first files, or takes the run and its files back to where it goes on.
-
-        Args:
-          driver: of the run.
-          found: the checkpoint from which it goes on, if any.
 
         Raises:
           OSError: a file cannot be written.
         """
-        config, reached = driver.config, None
-        self._due = SaveDue(config.checkpoint_every)
-        for path in (self._directory / name for name in (*_FILES, sinks.WANDB_RUN)):
-            for part in path.parent.glob(f".{path.name}.*"):  # what a crash left of writing it
-                part.unlink()
-        if config.resume is None:
-            self._write_first(config)
+        found, reached = self._found, None
+        if driver.config.resume is None:
+            self._write_first(driver.config)
         else:
-            self._take_back(config, config.resume, found)
-            if found is not None:
-                driver.restore(found)
-                reached = driver.updates()
-                self._due.saved(reached)
-                self._saved = True
+            self._take_back(driver.config, found)
+        self._go_on(driver, found)
+        if driver.config.resume is not None:
+            reached = None if found is None else driver.updates()
             again = "" if reached else ": there is no checkpoint yet, so it begins again"
             self._say(f"going on after {reached or 0} updates{again}")
-        self._sinks = open_sinks(config, self._directory, reached)
+        self._sinks = open_sinks(driver.config, self._directory, reached)
 
     def _write_first(self, config: Config) -> None:
         """Writes config.json, and a metrics.csv that has no rows yet."""
@@ -87,21 +68,20 @@ class RunFiles(Observer):
         self._write_json("config.json", settings | provenance())
         write_bytes(self._metrics, HEADER)
 
-    def _take_back(self, config: Config, directory: Path, found: Checkpoint | None) -> None:
+    def _take_back(self, config: Config, found: Checkpoint | None) -> None:
         """Takes the files back to a checkpoint, and says in config.json that the run goes on.
 
         A crash in between leaves a run that can be resumed: config.json is first, so that the
         budget in it chooses the same checkpoint.
         """
-        recorded = resume.read_record(directory)
         moment = {
             "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "updates": 0 if found is None else int(found.record["updates"].max()),
             "env_steps": 0 if found is None else int(found.record["env_steps"].sum()),
         }
-        recorded |= {name: getattr(config, name) for name in resume.BUDGETS}
-        resumed = [*recorded.get("resumed", []), moment]
-        self._write_json("config.json", recorded | {"resumed": resumed})
+        budgets = {name: getattr(config, name) for name in resume.BUDGETS}
+        resumed = [*self.contents.get("resumed", []), moment]
+        self._write_json("config.json", self.contents | budgets | {"resumed": resumed})
         self._write_json("summary.json", {"status": "running", **moment})
         checkpoint.remove_checkpoints(self._checkpoints, after=found.number if found else 0)
         if found is None:
@@ -109,25 +89,12 @@ class RunFiles(Observer):
         else:
             files.cut(self._metrics, found.metrics_bytes)
 
-    def updated(self, driver: Driver, met: Arrays) -> None:
-        """Saves if that is due; the last block is saved with its evaluation, by ``ended``."""
-        self._saved = False
-        if not driver.record.finished() and self._due.is_due(driver.updates()):
-            self._save(driver)
-
     def evaluated(self, driver: Driver, evaluation: Evaluation, rows: Cells) -> None:
         """Writes the rows of an evaluation."""
         self._waiting += lines(rows)
         self._attempt("metrics.csv", self._write_rows)
         for sink in self._sinks:
             self._attempt(sink.name, functools.partial(sink.write, rows))
-
-    def ended(self, driver: Driver) -> None:
-        """Saves the last state, unless it is saved; tries twice if a checkpoint is due."""
-        if self._due.is_due(driver.updates()):
-            self._save(driver)
-        if not self._saved:
-            self._save(driver)
 
     def finished(self, driver: Driver, summary: dict[str, Any]) -> None:
         """Writes the last files, summary.json last of all, or raises OSError."""
@@ -142,8 +109,7 @@ class RunFiles(Observer):
 
     def _save(self, driver: Driver) -> None:
         """Writes a checkpoint, the policies, and how far the run is, in case it is killed."""
-        self._due.saved(driver.updates())
-        self._saved = self._attempt("a checkpoint", lambda: self._save_checkpoint(driver))
+        super()._save(driver)
         self._attempt("the policies", lambda: self._save_policies(driver))
         reached = {
             "status": "running",
@@ -171,9 +137,6 @@ class RunFiles(Observer):
         files.append(self._metrics, self._waiting)
         self._waiting = b""
 
-    def _write_json(self, name: str, content: dict[str, Any]) -> None:
-        write_json(self._directory / name, content)
-
 
 def draw(driver: Driver) -> bytes:
     """Returns the contents of learning_curve.png."""
@@ -183,7 +146,7 @@ def draw(driver: Driver) -> bytes:
     return draw_learning_curve(history, training, config.env, record.threshold, axis)
 
 
-class Callbacks(Observer):
+class Callbacks(Observer[Driver]):
     """A user's own functions, called with each ``Evaluation``; one that returns true ends it."""
 
     def __init__(self, functions: Sequence[Callable[[Evaluation], Any]]):

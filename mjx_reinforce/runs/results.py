@@ -1,0 +1,254 @@
+"""Runs and sweeps from Python: ``mjx_reinforce.run`` and ``mjx_reinforce.sweep``."""
+
+import contextlib
+import dataclasses
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from mjx_reinforce.console.interrupt import Interrupt
+from mjx_reinforce.engine.checks import check_kind
+from mjx_reinforce.export.player import Player
+from mjx_reinforce.export.policy_files import build_policy
+from mjx_reinforce.export.run_files import Which
+from mjx_reinforce.files import read_arrays, read_json
+from mjx_reinforce.learning.policy import Actor, Policy
+from mjx_reinforce.runs.design import Design, check_swept
+from mjx_reinforce.runs.perform import perform
+from mjx_reinforce.runs.run_files import Callbacks
+from mjx_reinforce.runs.sweep_command import report_on
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.statistics import worst_if_not_finite
+from mjx_reinforce.training.driver import Driver, Evaluation
+
+
+class RunResults(NamedTuple):
+    """What a run of S seeds learned and measured, in E evaluations and U updates.
+
+    Attributes:
+      config: its settings, its horizon and its budget among them
+      directory: of its files, None where none were asked for
+      eval_return: [E, S] mean return of the policy's mode; NaN where it was not finite
+      env_steps: [E, S] trained until then
+      training: [U, S] each: ``episode_return``, the mean of an update's episodes, and the
+        ``env_steps`` and ``episodes`` after it
+      test_returns: [S] of the last policies, on starts that nothing else is played on
+      best_test_returns: [S] the same of the policies with the best evaluations
+      policy: the network and its distribution
+      actor: [S, ...] the last policies
+      best: [S, ...] the policies with the best evaluations
+      summary: the contents of summary.json
+
+    Examples:
+      >>> import dataclasses
+      >>> import mjx_reinforce as mr
+      >>> config = dataclasses.replace(
+      ...     mr.of_task("CartPole-v1", env_steps=200), num_seeds=2, eval_episodes=2
+      ... )
+      >>> results = mr.run(config, quiet=True)
+      >>> results.test_returns.shape, results.summary["status"]
+      ((2,), 'finished')
+    """
+
+    config: Config
+    directory: Path | None
+    eval_return: np.ndarray
+    env_steps: np.ndarray
+    training: dict[str, np.ndarray]
+    test_returns: np.ndarray
+    best_test_returns: np.ndarray
+    policy: Policy
+    actor: Actor
+    best: Actor
+    summary: dict[str, Any]
+
+    def __repr__(self) -> str:
+        mean = float(np.mean(self.test_returns))
+        return f"RunResults({self.config.env}, {len(self.test_returns)} seeds, return {mean:.4g})"
+
+    def player(self, seed: int | None = None, which: Which = "last") -> Player:
+        """Returns the policy of a seed, to play in Gymnasium or elsewhere.
+
+        Args:
+          seed: its number; by default the seed with the best return in the test.
+          which: "last" for the policy at the end of training, "best" for the one with the best
+            evaluation.
+        """
+        returns = self.test_returns if which == "last" else self.best_test_returns
+        if seed is None:
+            seed = int(np.argmax(worst_if_not_finite(returns)))
+        if not 0 <= seed < len(returns):
+            raise ValueError(f"seed must be in [0, {len(returns)}), got {seed}")
+        actors = self.actor if which == "last" else self.best
+        actor = jax.tree.map(lambda x: x[seed], actors)
+        return Player(self.config.env, seed, self.policy, actor)
+
+
+def run(
+    config: Config,
+    *,
+    output: Path | str | None = None,
+    observers: Sequence[Callable[[Evaluation], Any]] = (),
+    quiet: bool = False,
+) -> RunResults:
+    """Trains the seeds of a run, to the same numbers as ``python -m mjx_reinforce.train``.
+
+    Args:
+      config: the settings, such as ``mjx_reinforce.of_task("Hopper-v5")``; others by
+        ``dataclasses.replace``.
+      output: the directory of the run's files. None, with ``config.output`` None too, writes none.
+      observers: functions that are called with each evaluation. One that returns a true value
+        ends the run after the present block of updates.
+      quiet: show no progress.
+
+    Returns:
+      What was learned and measured.
+
+    Raises:
+      ValueError: a setting makes no sense, or the directory is not empty.
+      OSError: the last files of the run cannot be written.
+
+    Examples:
+      >>> import dataclasses
+      >>> import mjx_reinforce as mr
+      >>> config = dataclasses.replace(
+      ...     mr.of_task("CartPole-v1", env_steps=200), num_seeds=2, eval_episodes=2
+      ... )
+      >>> results = mr.run(config, quiet=True)
+      >>> results.test_returns.shape, results.summary["status"]
+      ((2,), 'finished')
+    """
+    check_kind("config", config, Config, 'mjx_reinforce.of_task("Hopper-v5")')
+    if not (isinstance(observers, Sequence) and all(map(callable, observers))):
+        raise ValueError(
+            "observers must be a list of functions of one Evaluation, such as "
+            f"[lambda evaluation: print(evaluation.seconds)], got {observers!r}"
+        )
+    if config.resume is not None:
+        raise ValueError(
+            f"run() begins a run: go on with {config.resume} by python -m mjx_reinforce.train "
+            f"--resume {config.resume}"
+        )
+    if output is not None:
+        config = dataclasses.replace(config, output=Path(output))
+    outcome = perform(
+        Design(base=config),
+        Interrupt(),  # that hears nothing: signals are the caller's
+        [Callbacks(observers)],
+        files=config.output is not None,
+        quiet=quiet,
+    )
+    driver, summary = outcome.driver, outcome.summary
+    assert isinstance(driver, Driver)
+    history = driver.record.history()
+    return RunResults(
+        config=driver.config,
+        directory=driver.config.output,
+        eval_return=history["eval_return"],
+        env_steps=history["env_steps"],
+        training=driver.record.training(),
+        test_returns=np.asarray(summary["final_test_returns"]),
+        best_test_returns=np.asarray(summary["best_test_returns"]),
+        policy=build_policy(outcome.policy),
+        actor=driver.states.train_states.actor,
+        best=driver.best.actor,
+        summary=summary,
+    )
+
+
+class SweepResults(NamedTuple):
+    """What a sweep measured, of R runs in E evaluations.
+
+    Attributes:
+      directory: of its files, None where none were asked for
+      configurations: the values of what was swept, in each
+      configuration: [R] the number of each run's
+      seed: [R]
+      eval_return: [E, R] mean return of the policy's mode; NaN where it was not finite
+      env_steps: [E, R] trained until then
+
+    Examples:
+      >>> import dataclasses
+      >>> import mjx_reinforce as mr
+      >>> config = dataclasses.replace(
+      ...     mr.of_task("CartPole-v1", env_steps=200), num_seeds=2, eval_episodes=2
+      ... )
+      >>> swept = mr.sweep(config, over={"discount": [0.98, 0.99]}, quiet=True)
+      >>> swept.configurations, swept.configuration.tolist()
+      ([{'discount': 0.98}, {'discount': 0.99}], [0, 0, 1, 1])
+    """
+
+    directory: Path | None
+    configurations: list[dict[str, Any]]
+    configuration: np.ndarray
+    seed: np.ndarray
+    eval_return: np.ndarray
+    env_steps: np.ndarray
+
+
+def sweep(
+    base: Config,
+    over: Mapping[str, Sequence[Any]],
+    *,
+    output: Path | str | None = None,
+    exact: bool = False,
+    chunk_runs: int | None = None,
+    report: bool = True,
+    quiet: bool = False,
+) -> SweepResults:
+    """Trains many configurations, ``base.num_seeds`` of each, as the command line does.
+
+    Args:
+      base: the settings that are not swept, such as ``mjx_reinforce.of_task("Hopper-v5")``.
+      over: names of settings and the values of each; all combinations are trained.
+      output: the directory of the sweep's files. None, with ``base.output`` None too, leaves none.
+      exact: move every run by itself, so that no result depends in any bit on the others.
+      chunk_runs: runs that are under way at once at most; as many as memory holds by default.
+      report: write report.html among the files.
+      quiet: show no progress.
+
+    Returns:
+      What was measured; the same is in the files of the directory.
+
+    Raises:
+      ValueError: a setting makes no sense, or the directory is not empty.
+      OSError: a file cannot be written.
+
+    Examples:
+      >>> import dataclasses
+      >>> import mjx_reinforce as mr
+      >>> config = dataclasses.replace(
+      ...     mr.of_task("CartPole-v1", env_steps=200), num_seeds=2, eval_episodes=2
+      ... )
+      >>> swept = mr.sweep(config, over={"discount": [0.98, 0.99]}, quiet=True)
+      >>> swept.configurations, swept.configuration.tolist()
+      ([{'discount': 0.98}, {'discount': 0.99}], [0, 0, 1, 1])
+    """
+    check_kind("base", base, Config, 'mjx_reinforce.of_task("Hopper-v5")')
+    check_swept(over)
+    with contextlib.ExitStack() as held:
+        asked = base.output if output is None else Path(output)
+        place = asked
+        if place is None:
+            place = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="sweep-")))
+        base = dataclasses.replace(base, output=place)
+        design = Design(base=base, over=over, exact=exact, chunk_runs=chunk_runs)
+        report_on(perform(design, Interrupt(), quiet=quiet), report=report and asked is not None)
+        return read_results(place)._replace(directory=asked)
+
+
+def read_results(directory: Path) -> SweepResults:
+    """Returns what a finished sweep measured, or raises ValueError."""
+    record = read_json(directory / "sweep.json")
+    if not (directory / "curves.npz").exists():
+        raise ValueError(
+            f"{directory} has no results yet: the sweep is {record.get('status', 'unfinished')}; "
+            f"go on with it by --resume {directory}"
+        )
+    listed = record["configurations"]
+    values = [{k: x for k, x in one.items() if k != "configuration"} for one in listed]
+    return SweepResults(directory, values, **read_arrays(directory / "curves.npz"))
