@@ -203,9 +203,9 @@ def begin_run(
     if config.init_from is not None and found is None:
         slots.restore(begin_with(slots.states(), last_actors(config, ready.policy)))
     if config.minutes is not None:
-        first = slots.states()
+        first = slots.rows()
         if found is not None:
-            slots.restore(found.state[0])
+            slots.restore(found.states)
         env_steps = env_steps_in(60 * config.minutes, slots, config)
         slots.restore(first)
         say(f"{config.minutes:g} min are about {env_steps:,} env steps of a seed in all here")

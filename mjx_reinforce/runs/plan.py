@@ -28,7 +28,7 @@ from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.division import Division, divide_run
 from mjx_reinforce.training.record import Runs
 from mjx_reinforce.training.slots import StateRows
-from mjx_reinforce.training.state import last_actors, shape_of_all
+from mjx_reinforce.training.state import last_actors
 
 
 class Group(NamedTuple):
@@ -113,7 +113,7 @@ def prepare(design: Design, env: Environment | None, say: Callable[[str], None])
     config, division, found = design.base, divide_run(design.base), None
     ready = get_ready(config, design.default or config, env)
     if config.resume is not None:
-        found = _find(config, ready, say)
+        found = _find(config, say)
     if config.init_from is not None and found is None:
         last_actors(config, ready.policy)  # refused before anything is compiled
     group, width = Group(config, np.zeros(1, int), {}), division.lanes(config.num_seeds)
@@ -121,17 +121,16 @@ def prepare(design: Design, env: Environment | None, say: Callable[[str], None])
     return Prepared(design, [part], division, known, found)
 
 
-def _find(config: Config, ready: Ready, say: Callable[[str], None]) -> Checkpoint | None:
+def _find(config: Config, say: Callable[[str], None]) -> Checkpoint | None:
     """Returns the checkpoint from which a run in its directory goes on, if there is one.
 
     Raises:
       ValueError: the run cannot go on here.
     """
-    like = shape_of_all(ready.programs().like, config.num_seeds)
     if config.minutes is None:
-        return resume.newest_checkpoint(like, config, say)
+        return resume.newest_checkpoint(config, say)
     # More than any checkpoint has used.
-    found = resume.newest_checkpoint(like, dataclasses.replace(config, env_steps=MAX_COUNT), say)
+    found = resume.newest_checkpoint(dataclasses.replace(config, env_steps=MAX_COUNT), say)
     if found is None:
         raise ValueError(
             f"{config.resume} has no checkpoint to go on from for {config.minutes:g} min; leave "

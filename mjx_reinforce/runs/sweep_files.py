@@ -89,8 +89,7 @@ class SweepFiles(Files[Training]):
 
     def began(self, driver: Training) -> None:
         """Takes a chunk to its newest checkpoint, if there is one."""
-        like = driver.slots.states()
-        found = checkpoint.read_checkpoints(self._folder(driver), like, self._say)
+        found = checkpoint.read_checkpoints(self._folder(driver), self._say)
         self._go_on(driver, next(found, None))
 
     def ended(self, driver: Training) -> None:

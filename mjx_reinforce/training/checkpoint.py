@@ -17,10 +17,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
-from mjx_reinforce.engine.base import PyTree, plain, with_keys
 from mjx_reinforce.files import Arrays, check_stored, write_bytes
 
 _KEPT = 2
@@ -30,7 +28,9 @@ _NAME = re.compile(r"\d{6,}-(even-)?[0-9a-f]{16}\.npz")
 class Checkpoint(NamedTuple):
     """All that a run needs to go on as if it had not stopped.
 
-    state: the pytree that its programs move on, every leaf an array
+    layout: of the states, see ``StateRows.layout``
+    states: [R, B] of the runs as rows of bytes
+    best: [R, B] of a run's best policies; without rows in a sweep's
     record: what ``Record.arrays`` returns
     seconds: wall time since the run began, without that of compiling
     metrics_bytes: length of metrics.csv
@@ -40,7 +40,9 @@ class Checkpoint(NamedTuple):
     number: its place among the run's checkpoints, once it is saved
     """
 
-    state: Any
+    layout: str
+    states: np.ndarray
+    best: np.ndarray
     record: Arrays
     seconds: float
     metrics_bytes: int
@@ -81,25 +83,22 @@ def save(folder: Path, checkpoint: Checkpoint, *, even: bool) -> None:
             path.unlink()
 
 
-def read_checkpoints(
-    folder: Path, like: PyTree, say: Callable[[str], None]
-) -> Iterator[Checkpoint]:
+def read_checkpoints(folder: Path, say: Callable[[str], None]) -> Iterator[Checkpoint]:
     """Yields the checkpoints of a folder, the newest first, without those that are damaged.
 
     Args:
       folder: what ``save`` wrote to; it need not exist.
-      like: a state of the run, for its structure, shapes and types.
       say: shows a line about each damaged file.
 
     Raises:
-      ValueError: a checkpoint is whole, but its state is not like that.
+      ValueError: a checkpoint is whole, but of another version of the program.
     """
     for path in _archives(folder):
         content = _read(path)
         if content is None:
             say(f"checkpoint {path.name} is damaged; trying the one before")
         else:
-            yield _decode(content, path, like)
+            yield _decode(content, path)
 
 
 def settings_of(folder: Path) -> dict[str, Any]:
@@ -143,63 +142,35 @@ def _read(path: Path) -> bytes | None:
     return content if _digest(content) == path.stem.rpartition("-")[2] else None
 
 
+#: The fields that are arrays of their own.
+_ROWS = ("states", "best")
+
+
 def _encode(checkpoint: Checkpoint) -> bytes:
-    """Returns a NumPy archive: the state's leaves by their path, the record's arrays, the rest."""
-    state, rest = _flatten(checkpoint.state), checkpoint._asdict()
+    """Returns a NumPy archive: the rows, the record's arrays, and the rest as JSON."""
+    rest = checkpoint._asdict()
     record = {f"record/{name}": values for name, values in rest.pop("record").items()}
-    del rest["state"], rest["number"]
+    rows = {name: rest.pop(name) for name in _ROWS}
+    del rest["number"]
     archive = io.BytesIO()
-    np.savez(archive, allow_pickle=False, rest=np.array(json.dumps(rest)), **state, **record)
+    np.savez(archive, allow_pickle=False, rest=np.array(json.dumps(rest)), **rows, **record)
     return archive.getvalue()
 
 
-def _decode(content: bytes, path: Path, like: PyTree) -> Checkpoint:
+def _decode(content: bytes, path: Path) -> Checkpoint:
     """Reads what ``_encode`` returned; see ``read_checkpoints``."""
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         rest = json.loads(str(arrays.pop("rest")))
-        record = {
-            name.removeprefix("record/"): arrays.pop(name)
-            for name in list(arrays)
-            if name.startswith("record/")
-        }
-        state = _unflatten(arrays, like)
-        return Checkpoint(state=state, record=record, number=_number(path), **rest)
+        rows = {name: arrays.pop(name) for name in _ROWS}
+        record = {name.removeprefix("record/"): x for name, x in arrays.items()}
+        return Checkpoint(record=record, number=_number(path), **rows, **rest)
     except (KeyError, TypeError, zipfile.BadZipFile, ValueError) as error:
         raise ValueError(
             f"{path} does not fit this version of the program ({error}); "
             "resume with the version that wrote it"
         ) from error
-
-
-def _flatten(tree: PyTree) -> Arrays:
-    """Returns the leaves of a pytree on the host under the names of their paths; keys as data."""
-    leaves, _ = jax.tree.flatten_with_path(plain(tree))
-    raw = {_name(path): leaf for path, leaf in leaves}
-    return {name: np.asarray(value) for name, value in jax.device_get(raw).items()}
-
-
-def _unflatten(arrays: Arrays, like: PyTree) -> Any:
-    """Returns a pytree like another, from what ``_flatten`` returned.
-
-    Raises:
-      ValueError: an array is missing, or superfluous, or has another shape or type.
-    """
-    shapes, structure = jax.tree.flatten_with_path(jax.eval_shape(plain, like))
-    expected = {_name(path): shape for path, shape in shapes}
-    if wrong := sorted(expected.keys() ^ arrays.keys()):
-        raise ValueError(f"{wrong[0]} is in one of the two only")
-    for name, shape in expected.items():
-        here, there = (shape.shape, shape.dtype), (arrays[name].shape, arrays[name].dtype)
-        if here != there:
-            raise ValueError(f"{name} is {there[1]} {there[0]} there, {here[1]} {here[0]} here")
-    values = [arrays[name] for name in expected]
-    return with_keys(jax.tree.unflatten(structure, values), like)
-
-
-def _name(path: jax.tree_util.KeyPath) -> str:
-    return "state/" + jax.tree_util.keystr(path, simple=True, separator="/")
 
 
 #: Between checkpoints, where the user has not said how many updates.

@@ -14,7 +14,7 @@ from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.record import Cells, Record, RunRecord
 from mjx_reinforce.training.resume import recordable
-from mjx_reinforce.training.slots import Measured, Slots
+from mjx_reinforce.training.slots import Measured, Slots, StateRows
 from mjx_reinforce.training.state import Best, first_best, keep_best
 
 
@@ -130,8 +130,13 @@ class Training:
         self._began = time.perf_counter()
 
     def restore(self, found: Checkpoint) -> None:
-        """Goes back to a checkpoint."""
-        self.slots.restore(found.state)
+        """Goes back to a checkpoint, or raises ValueError if it is another program's."""
+        if found.layout != self.slots.layout.layout:
+            raise ValueError(
+                "the states in the checkpoint do not fit this version of the program; resume with "
+                "the version that wrote it"
+            )
+        self.slots.restore(found.states)
         self.record.restore(found.record)
         self._began = time.perf_counter() - found.seconds
 
@@ -139,7 +144,9 @@ class Training:
         """Returns what ``restore`` takes."""
         config = self.config
         return Checkpoint(
-            state=self.slots.states(),
+            layout=self.slots.layout.layout,
+            states=self.slots.rows(),
+            best=np.zeros((0, 0), np.uint8),
             record=self.record.arrays(),
             seconds=self.seconds(),
             metrics_bytes=0,
@@ -206,15 +213,15 @@ class Driver(Training):
         self._reached = 0.0
 
     def restore(self, found: Checkpoint) -> None:
-        """Goes back to a checkpoint, whose state has the best policies too."""
-        self.states, self.best = found.state
-        super().restore(found._replace(state=self.states))
+        """Goes back to a checkpoint, which has the best policies too."""
+        super().restore(found)
+        self.states, self.best = self.slots.states(), StateRows(self.best).states(found.best)
         self._reached = found.seconds
 
     def checkpoint(self) -> Checkpoint:
         """Returns what ``restore`` takes."""
         whole, settings = super().checkpoint(), recordable(self.config)
-        return whole._replace(state=(whole.state, self.best), settings=settings)
+        return whole._replace(best=StateRows(self.best).rows(self.best), settings=settings)
 
     def drive(self, interrupted: Callable[[], bool]) -> None:
         """Trains as any runs; what was made before an observer's end is evaluated."""

@@ -14,7 +14,6 @@ from mjx_reinforce.settings.declare import Mark
 
 if TYPE_CHECKING:
     from mjx_reinforce.training.checkpoint import Checkpoint
-    from mjx_reinforce.training.state import RunState
 
 #: What may change when a run goes on: when it ends, and how often it is saved.
 BUDGETS = marked(Mark.BUDGET)
@@ -173,11 +172,10 @@ def _without_devices(flags: object) -> str:
     return " ".join(kept)
 
 
-def newest_checkpoint(like: "RunState", config: Config, say: Callable[[str], None]) -> Any:
+def newest_checkpoint(config: Config, say: Callable[[str], None]) -> "Checkpoint | None":
     """Returns the newest usable checkpoint, or None: then the run starts again.
 
     Args:
-      like: the shapes of its ``RunState``.
       config: its settings, with the budget that it is to have.
       say: shows a line about each file that does not serve.
 
@@ -186,14 +184,12 @@ def newest_checkpoint(like: "RunState", config: Config, say: Callable[[str], Non
         a checkpoint is of another version.
     """
     from mjx_reinforce.training import checkpoint
-    from mjx_reinforce.training.state import shape_of_best
 
     assert config.resume is not None
     _check_unchanged(config, checkpoint.settings_of(config.resume / "checkpoint"))
-    states = like, shape_of_best(like.train_states)
     metrics = config.resume / "metrics.csv"
     length = metrics.stat().st_size if metrics.exists() else 0
-    for found in checkpoint.read_checkpoints(config.resume / "checkpoint", states, say):
+    for found in checkpoint.read_checkpoints(config.resume / "checkpoint", say):
         if found.metrics_bytes > length:
             say(f"metrics.csv is shorter than at checkpoint {found.number}; trying the one before")
         elif _serves(found, config):

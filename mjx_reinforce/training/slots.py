@@ -12,6 +12,7 @@ costs as much to choose, to send and to fetch as all of them in one array.
 
 import dataclasses
 import functools
+import hashlib
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -48,6 +49,12 @@ class StateRows:
             for shape, kind in zip(self._shapes, self._types, strict=True)
         ]
         *self._ends, self.size = np.cumsum(sizes).tolist()
+
+    @property
+    def layout(self) -> str:
+        """What is in a row, in short: rows of another layout are others' states."""
+        known = repr((self._structure, self._shapes, self._types))
+        return hashlib.sha256(known.encode()).hexdigest()
 
     def rows(self, states: PyTree) -> np.ndarray:
         """Returns the rows of states, on the host."""
@@ -197,6 +204,7 @@ class Slots:
     of a run, are also where they were computed.
 
     budget: of each run
+    layout: what is in a row of its states
     """
 
     def __init__(self, compiled: Compiled, numbers: np.ndarray, settings: Arrays | None = None):
@@ -208,7 +216,7 @@ class Slots:
           settings: [R] each, those that differ from run to run, if any do.
         """
         self._compiled, self._rides = compiled, compiled.programs.rides
-        self._division, self._layout = compiled.programs.division, StateRows(compiled.programs.like)
+        self._division, self.layout = compiled.programs.division, StateRows(compiled.programs.like)
         self.budget = budget_of(compiled.config)
         width, count = max(compiled.slots), len(numbers)
         kind = jnp.result_type(float)
@@ -228,11 +236,16 @@ class Slots:
 
     def states(self) -> RunState:
         """Returns the states of all runs, on the host in memory of their own."""
-        return self._layout.states(self._rows)
+        return self.layout.states(self._rows)
 
-    def restore(self, states: RunState) -> None:
-        """Takes other states of these runs."""
-        self._rows, self._placed = self._layout.rows(states), None
+    def rows(self) -> np.ndarray:
+        """Returns the states as rows, in memory of their own."""
+        return self._rows.copy()
+
+    def restore(self, states: RunState | np.ndarray) -> None:
+        """Takes other states of these runs, or rows of them."""
+        rows = states if isinstance(states, np.ndarray) else self.layout.rows(states)
+        self._rows, self._placed = rows, None
 
     def advance(
         self,

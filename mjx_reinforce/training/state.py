@@ -77,18 +77,10 @@ class Best(struct.PyTreeNode, kw_only=True):
     num_updates: Any
 
 
-def shape_of_best(train_states: TrainState) -> Best:
-    """Returns the shapes of the best policies of states, or of their shapes."""
-    num_updates = train_states.num_updates
-    returns = jax.ShapeDtypeStruct(num_updates.shape[:1], jnp.result_type(float))
-    return Best(actor=train_states.actor, eval_return=returns, num_updates=num_updates)
-
-
 def first_best(train_states: TrainState) -> Best:
     """Returns the state before the first evaluation, in memory of its own."""
-    returns = shape_of_best(train_states).eval_return
     actor, num_updates = jax.tree.map(np.array, (train_states.actor, train_states.num_updates))
-    worst = np.full(returns.shape, -np.inf, returns.dtype)
+    worst = np.full(len(num_updates), -np.inf, jnp.result_type(float))
     return Best(actor=actor, eval_return=worst, num_updates=num_updates)
 
 

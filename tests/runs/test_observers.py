@@ -32,7 +32,7 @@ class Run:
 
     def checkpoint(self):
         record = {"updates": np.full(2, self.made)}
-        return Checkpoint(None, record, self.made, 0, None, None)
+        return Checkpoint("", None, None, record, self.made, 0, None, None)
 
 
 @pytest.fixture
