@@ -247,8 +247,9 @@ def _read_run(directory: Path, config: dict[str, Any]) -> Source:
     columns = read_metrics(directory / "metrics.csv", first)
     num_seeds = len(columns["seed"])
     with naming_damage(path):
-        events = np.array([event["seed"] for event in summary.get("nonfinite", [])], np.int64)
-        nonfinite = np.bincount(events - first, minlength=num_seeds)[:num_seeds]
+        counts = summary.get("nonfinite", [0] * num_seeds)
+        check_type("nonfinite", counts, tuple[int, ...])
+        nonfinite = np.array(counts, np.int64)
         outcome = _outcome(summary)
     where = [directory] * num_seeds
     kept = {name: value for name, value in config.items() if name in PROVENANCE}

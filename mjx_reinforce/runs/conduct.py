@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.files import Arrays
 from mjx_reinforce.learning import counts
 from mjx_reinforce.reports.curves import load_libraries
 from mjx_reinforce.reports.experiment import counted, say, setting_in_words
@@ -117,7 +116,7 @@ class Conductor(Observer[Training]):
             observer.finished(driver, summary)
         return driver, summary
 
-    def updated(self, driver: Training, met: Arrays) -> None:
+    def updated(self, driver: Training, met: np.ndarray) -> None:
         """Shows how far a sweep is."""
         self._display.show_progress(self._progress(driver))
 

@@ -18,7 +18,6 @@ from rich.text import Text
 
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.streams import heartbeat
-from mjx_reinforce.files import Arrays
 from mjx_reinforce.settings.config import env_flag
 from mjx_reinforce.statistics import enough, iqm
 from mjx_reinforce.training import progress
@@ -109,10 +108,11 @@ class Display(Observer[Driver]):
                 f"{_returns_and_speed(now)}  {done}  {left}".rstrip()
             )
 
-    def updated(self, driver: Driver, met: Arrays) -> None:
-        """Says in a line which updates of a block met numbers that are not finite, if any did."""
-        if len(met["seed"]):
-            self.say(progress.describe_nonfinite(met, driver.config.num_seeds), "yellow")
+    def updated(self, driver: Driver, met: np.ndarray) -> None:
+        """Says in a line which seeds met numbers that are not finite, if any did."""
+        if met.any():
+            said = progress.describe_nonfinite(met, driver.config.first_seed, driver.updates())
+            self.say(said, "yellow")
 
     def evaluated(self, driver: Driver, evaluation: Evaluation, rows: Cells) -> None:
         """Shows how far the run is and how well it does."""

@@ -4,7 +4,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mjx_reinforce.files import Arrays, remove_parts, write_json
+import numpy as np
+
+from mjx_reinforce.files import remove_parts, write_json
 from mjx_reinforce.training.checkpoint import Attempts, Checkpoint, SaveDue
 from mjx_reinforce.training.driver import Observer, Seen
 
@@ -42,7 +44,7 @@ class Files(Observer[Seen]):
         """Returns whether the runs of this name have ended."""
         return False
 
-    def updated(self, driver: Seen, met: Arrays) -> None:
+    def updated(self, driver: Seen, met: np.ndarray) -> None:
         """Saves if that is due; the last block is saved with its evaluation, by ``ended``."""
         self._saved = False
         if not driver.record.finished() and self._due.is_due(driver.updates()):

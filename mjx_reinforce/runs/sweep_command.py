@@ -32,6 +32,9 @@ def report_on(outcome: "Outcome", *, report: bool = True) -> None:
         flags = code_flags(summary["settings"])
         display.say(f"interrupted; go on with --resume {directory}{flags}")
         return
+    if outcome.driver is None and (directory / "report.html").exists():
+        display.say(f"the sweep in {directory} is finished")
+        return
     took = (
         f"compiling took {summary['compile_seconds']:.1f} s, training and evaluating "
         f"{summary['run_seconds']:.1f} s"

@@ -60,13 +60,12 @@ class Observer(Generic[Seen]):
     def began(self, driver: Seen) -> None:
         """Called before the first update, also of runs that go on."""
 
-    def updated(self, driver: Seen, met: Arrays) -> None:
+    def updated(self, driver: Seen, met: np.ndarray) -> None:
         """Called after each block of updates.
 
         Args:
           driver: of the runs.
-          met: the updates in it that met numbers which are not finite, as
-            ``RunRecord.add_updates`` returns them; nothing in a sweep.
+          met: [S] how many of them met numbers which are not finite, of each seed; none in a sweep.
         """
 
     def evaluated(self, driver: Seen, evaluation: Evaluation, rows: Cells) -> None:
@@ -181,9 +180,9 @@ class Training:
         """Takes in evaluations and the updates after them."""
         self.record.add(blocks, self.seconds())
         if blocks[0].metrics:
-            self._updated({})
+            self._updated(np.zeros(0, int))
 
-    def _updated(self, met: Arrays) -> None:
+    def _updated(self, met: np.ndarray) -> None:
         for observer in self.observers:
             observer.updated(self, met)
 

@@ -4,7 +4,7 @@ Updates may meet numbers that are not finite: which ones, and when a seed is pas
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -90,8 +90,6 @@ HOPELESS = (
     "every seed that still trained was broken throughout the last updates, its episodes "
     "or its new policy not finite; lower --learning-rate (ars: --step-size) or mend the task"
 )
-#: The fields of such an update, in the order of summary.json.
-EVENT_COLUMNS = {"seed": np.int64, "update": np.int64, "episodes": np.int64, "skipped": np.bool_}
 #: A run is not given up before each of its seeds was broken so many updates in a row: blocks may
 #: be shorter, and a seed may recover from one such update, since the next draws other numbers.
 _FEWEST = 5
@@ -99,29 +97,14 @@ _FEWEST = 5
 _NAMED = 5
 
 
-def nonfinite_updates(metrics: Arrays, updates: np.ndarray) -> Arrays:
-    """Returns the M updates of a block that met numbers which are not finite.
+def nonfinite_updates(metrics: Arrays) -> np.ndarray:
+    """Returns how many updates of a block met numbers which are not finite, of each seed [S].
 
     Args:
-      metrics: [K, S] each, as for ``RunRecord.add_updates``.
-      updates: [K, S] how many each seed had made after each of them.
-
-    Returns:
-      [M] each: ``seed``, ``update`` (how many the seed had made before it), ``episodes`` (how many
-      of it left the finite numbers) and ``skipped`` (whether the policy stayed as it was).
+      metrics: [K, S] each, as for ``Record.add``.
     """
-    episodes, skipped = metrics["nonfinite_episodes"], metrics["skipped_update"]
-    k, s = np.nonzero((episodes + skipped) * metrics["active"])
-    found = (s, updates[k, s] - 1, episodes[k, s], skipped[k, s])
-    return {
-        name: x.astype(kind) for (name, kind), x in zip(EVENT_COLUMNS.items(), found, strict=True)
-    }
-
-
-def as_events(updates: Arrays) -> list[dict[str, Any]]:
-    """Returns the updates of ``nonfinite_updates`` one by one, as summary.json has them."""
-    columns = (updates[name].tolist() for name in EVENT_COLUMNS)
-    return [dict(zip(EVENT_COLUMNS, event, strict=True)) for event in zip(*columns, strict=True)]
+    broken = (metrics["nonfinite_episodes"] > 0) | (metrics["skipped_update"] > 0)
+    return (broken & metrics["active"]).sum(axis=0)
 
 
 def broken_in_a_row(before: np.ndarray, metrics: Arrays) -> np.ndarray:
@@ -131,7 +114,7 @@ def broken_in_a_row(before: np.ndarray, metrics: Arrays) -> np.ndarray:
 
     Args:
       before: [S] the same before this block.
-      metrics: [K, S] each, as for ``RunRecord.add_updates``.
+      metrics: [K, S] each, as for ``Record.add``.
     """
     broken = metrics["nonfinite_episodes"] >= metrics["episodes"]
     broken |= metrics["skipped_update"] > 0
@@ -153,14 +136,17 @@ def hopeless(in_a_row: np.ndarray, used: np.ndarray, block: int) -> bool:
     return bool(training.any() and np.all(in_a_row[training] >= max(block, _FEWEST)))
 
 
-def describe_nonfinite(updates: Arrays, num_seeds: int) -> str:
-    """Returns one line about at least one update of ``nonfinite_updates``."""
-    first, last = updates["update"].min(), updates["update"].max()
-    seeds = np.unique(updates["seed"]).tolist()
+def describe_nonfinite(met: np.ndarray, first_seed: int, updates: int) -> str:
+    """Returns one line about ``nonfinite_updates`` of which at least one is not 0.
+
+    Args:
+      met: [S] how many of a block, of each seed.
+      first_seed: the number of the first seed.
+      updates: how many there were after the block.
+    """
+    seeds = (first_seed + np.flatnonzero(met)).tolist()
     named = ", ".join(map(str, seeds[:_NAMED])) + (", ..." if len(seeds) > _NAMED else "")
-    when = f"update {first}" if first == last else f"updates {first} to {last}"
     return (
-        f"{when}: {len(seeds):,} of {num_seeds:,} seeds met numbers that are not finite or beyond "
-        f"1e10 ({named}): {updates['episodes'].sum():,} episodes, "
-        f"{updates['skipped'].sum():,} updates skipped"
+        f"up to update {updates}: {len(seeds):,} of {len(met):,} seeds met numbers that are not "
+        f"finite or beyond 1e10 ({named}), in {met.sum():,} updates"
     )

@@ -133,17 +133,19 @@ class Record:
 
     updates: [R] int64, how many each has made
     env_steps: [R] int64, how many each has played in training
+    nonfinite: [R] int64, how many of its updates met numbers that are not finite
     seconds: wall time from the end of compilation to what was measured last
     """
 
     #: What a checkpoint has besides the tables.
-    _kept: tuple[str, ...] = ("updates", "env_steps", "seconds")
+    _kept: tuple[str, ...] = ("updates", "env_steps", "nonfinite", "seconds")
 
     def __init__(self, config: Config):
         """Begins before the first update; R is ``config.num_seeds``."""
         self.config = config
         self.updates = np.zeros(config.num_seeds, np.int64)
         self.env_steps = np.zeros(config.num_seeds, np.int64)
+        self.nonfinite = np.zeros(config.num_seeds, np.int64)
         self.seconds = 0.0
         self._tables = {"evaluations": GrowingTable({})}
 
@@ -231,17 +233,15 @@ class ChunkRecord(Record):
     """What the R runs of a chunk of a sweep have measured.
 
     runs: which they are
-    nonfinite: [R] how many of its updates met numbers that are not finite
     lengths: [R] the steps of all episodes of each run's latest evaluation
     """
 
-    _kept = ("updates", "env_steps", "seconds", "nonfinite", "lengths")
+    _kept = (*Record._kept, "lengths")
 
     def __init__(self, config: Config, runs: Runs):
         """Begins before the first update; R is ``config.num_seeds``."""
         super().__init__(config)
         self.runs = runs
-        self.nonfinite = np.zeros(config.num_seeds, np.int64)
         self.lengths = np.zeros(config.num_seeds, np.int64)
         self._before = self.env_steps, self.seconds
 
@@ -262,11 +262,10 @@ class ChunkRecord(Record):
         self._tables["evaluations"].append({name: x[None] for name, x in latest.items()})
 
     def _add_updates(self, runs: np.ndarray, metrics: Arrays) -> None:
-        broken = (metrics["nonfinite_episodes"] > 0) | (metrics["skipped_update"] > 0)
         self.updates[runs] += metrics["active"].sum(axis=0)
         steps = np.where(metrics["active"], metrics["env_steps"], 0)
         self.env_steps[runs] += steps.sum(axis=0, dtype=np.int64)
-        self.nonfinite[runs] += (broken & metrics["active"]).sum(axis=0)
+        self.nonfinite[runs] += progress.nonfinite_updates(metrics)
 
     def latest(self) -> Arrays:
         """Returns ``eval_return`` of each run's latest evaluation, and ``env_steps`` until then."""
@@ -311,10 +310,7 @@ class RunRecord(Record):
     threshold: the return that counts as solved, if any
     """
 
-    _kept = (
-        *("updates", "env_steps", "episodes", "seconds"),
-        *("broken_in_a_row", "simulated", "evaluated"),
-    )
+    _kept = (*Record._kept, "episodes", "broken_in_a_row", "simulated", "evaluated")
 
     def __init__(self, config: Config, threshold: float | None):
         """Begins before the first update.
@@ -329,12 +325,8 @@ class RunRecord(Record):
         self.broken_in_a_row = np.zeros(num_seeds, np.int64)
         self.simulated = self.evaluated = 0
         kinds = {"episode_return": np.float32, "env_steps": np.int64, "episodes": np.int64}
-        self._tables |= {
-            "training": GrowingTable({k: np.zeros((0, num_seeds), x) for k, x in kinds.items()}),
-            "nonfinite": GrowingTable(
-                {k: np.zeros(0, x) for k, x in progress.EVENT_COLUMNS.items()}
-            ),
-        }
+        first = {name: np.zeros((0, num_seeds), kind) for name, kind in kinds.items()}
+        self._tables["training"] = GrowingTable(first)
         self._last: Arrays = {}
 
     def arrays(self) -> Arrays:
@@ -346,7 +338,7 @@ class RunRecord(Record):
         super().restore(arrays)
         self._last = _of_group(arrays, "last")
 
-    def add_updates(self, metrics: Arrays) -> Arrays:
+    def add_updates(self, metrics: Arrays) -> np.ndarray:
         """Takes in a block of updates.
 
         A training return is NaN if one of its episodes left the finite numbers.
@@ -356,8 +348,7 @@ class RunRecord(Record):
             ``block_of_updates``.
 
         Returns:
-          The updates in it that met numbers which are not finite, see
-          ``progress.nonfinite_updates``.
+          What ``progress.nonfinite_updates`` does.
         """
         active, played = metrics["active"], metrics["episodes"]
         finite = metrics["nonfinite_episodes"] == 0
@@ -376,9 +367,8 @@ class RunRecord(Record):
         self.episodes = episodes[-1]
         self.simulated += _sum(metrics["simulated_steps"])
         self.broken_in_a_row = progress.broken_in_a_row(self.broken_in_a_row, metrics)
-        met = progress.nonfinite_updates(metrics, updates)
-        met["seed"] += self.config.first_seed
-        self._tables["nonfinite"].append(met)
+        met = progress.nonfinite_updates(metrics)
+        self.nonfinite = self.nonfinite + met
         self._remember(metrics | {"episode_return": returns})
         return met
 
@@ -465,7 +455,7 @@ class RunRecord(Record):
             "run_seconds": run_seconds,
             "env_steps_per_second": float(env_steps / run_seconds),
             "useful_step_fraction": float((env_steps + self.evaluated) / max(self.simulated, 1)),
-            "nonfinite": progress.as_events(self._tables["nonfinite"].columns()),
+            "nonfinite": self.nonfinite.tolist(),
         }
 
 

@@ -27,7 +27,7 @@ def test_runs_are_told_apart_by_what_differs(tmp_path):
 def make_shares(folder, *, second=3, **changes):
     first = make_measured_run(folder / "a", num_seeds=3, seeds="0:3")
     settings = {"seeds": f"{second}:{second + 2}"} | changes
-    said = {"nonfinite": [{"seed": second, "update": 1}]}
+    said = {"nonfinite": [1, 0]}
     made = {"num_seeds": 2, "first": second, "evaluations": 3, "summary": said}
     return make_measured_run(folder / "b", **made, **settings), first
 

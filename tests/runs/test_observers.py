@@ -146,11 +146,12 @@ def test_the_screen_shows_progress_and_what_is_not_finite(monkeypatch):
     monkeypatch.setattr(display, "show_progress", shown.append)
     monkeypatch.setattr(display, "say", lambda text, style: shown.append(text))
     run = SimpleNamespace(
-        config=Config(num_seeds=3), record=SimpleNamespace(progress=lambda: "half")
+        config=Config(num_seeds=3),
+        record=SimpleNamespace(progress=lambda: "half"),
+        updates=lambda: 1,
     )
     display.evaluated(run, None, {})
-    none = {name: np.zeros(0, int) for name in ("seed", "update", "episodes", "skipped")}
-    display.updated(run, none)
-    display.updated(run, {name: np.ones(1, int) for name in none})
+    display.updated(run, np.zeros(3, int))
+    display.updated(run, np.array([0, 1, 0]))
     assert shown[0] == "half"
-    assert [text.partition(" seeds")[0] for text in shown[1:]] == ["update 1: 1 of 3"]
+    assert [text.partition(" seeds")[0] for text in shown[1:]] == ["up to update 1: 1 of 3"]

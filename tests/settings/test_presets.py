@@ -40,7 +40,7 @@ def test_a_preset_trains(name, run, tmp_path):
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     config = json.loads((tmp_path / "out" / "config.json").read_text())
     assert np.all(np.isfinite(summary["final_returns"]))
-    assert not summary["nonfinite"]
+    assert not any(summary["nonfinite"])
     episodes = PRESETS[name][1].episodes_per_update
     with np.load(tmp_path / "out" / "returns.npz", allow_pickle=False) as training:
         assert training["episode_return"].shape == training["env_steps"].shape == (2, 2)

@@ -16,7 +16,7 @@ from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import summarize
 from mjx_reinforce.training import progress
 from mjx_reinforce.training.block import evaluate
-from mjx_reinforce.training.progress import Progress, as_events
+from mjx_reinforce.training.progress import Progress
 from mjx_reinforce.training.record import RunRecord
 
 
@@ -106,7 +106,7 @@ def test_a_record_of_two_seeds_by_hand():
     assert record.progress().fraction == 0
     met = record.add_updates(METRICS)
     assert not record.is_evaluated()
-    assert as_events(met) == [{"seed": 0, "update": 1, "episodes": 2, "skipped": True}]
+    assert met.tolist() == [1, 0]
     second = record.add_evaluation(evaluation(7, 10), 2.00009)
     keys = ("seed", "update", "episodes", "env_steps", "wall_seconds", "train_return")
     assert [*zip(*(second[key] for key in keys), strict=True)] == [
@@ -126,7 +126,7 @@ def test_a_record_of_two_seeds_by_hand():
     # 50 + 60 + 40 in training and 2 (7 + 7) in evaluations.
     assert summary["useful_step_fraction"] == (70 + 40 + 2 * 12) / (150 + 2 * 14)
     assert summary["env_steps_per_second"] == 55
-    assert len(summary["nonfinite"]) == 1
+    assert summary["nonfinite"] == [1, 0]
 
 
 def test_a_test_counts_among_what_was_simulated():
@@ -163,14 +163,10 @@ def test_a_run_is_hopeless_if_all_that_train_are():
 
 
 def test_a_block_of_broken_updates_is_one_line():
-    metrics = block(np.random.default_rng(1), 4, 9)
-    metrics["nonfinite_episodes"] = np.full((4, 9), 2)
-    metrics["skipped_update"] = np.zeros((4, 9), int)
-    made = 6 + np.cumsum(metrics["active"], axis=0)
-    assert progress.describe_nonfinite(progress.nonfinite_updates(metrics, made), 1000) == (
-        "updates 6 to 9: 9 of 1,000 seeds met numbers that are not finite or beyond 1e10 "
-        "(0, 1, 2, 3, 4, ...): "
-        "66 episodes, 0 updates skipped"  # the last seed made one update of four
+    met = np.repeat([0, 2], [994, 6])
+    assert progress.describe_nonfinite(met, 7, 9) == (
+        "up to update 9: 6 of 1,000 seeds met numbers that are not finite or beyond 1e10 "
+        "(1001, 1002, 1003, 1004, 1005, ...), in 12 updates"
     )
 
 
