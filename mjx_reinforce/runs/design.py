@@ -16,17 +16,14 @@ from mjx_reinforce.engine.checks import alternatives, check_name, nearest, read_
 from mjx_reinforce.engine.memory import gigabytes, host_memory
 from mjx_reinforce.runs.sinks import check_installed
 from mjx_reinforce.settings.config import (
-    MAX_OF_UPDATE,
     Config,
     changed,
     check,
     check_each,
     check_read,
     flag,
-    marked,
     spoken,
 )
-from mjx_reinforce.settings.declare import Range
 from mjx_reinforce.settings.groups import LogSettings
 from mjx_reinforce.training.resume import PLACES, as_config, read_record
 
@@ -121,7 +118,6 @@ def check_design(design: Design) -> None:
     """Raises ValueError for what makes no sense, before anything heavy is imported."""
     if not design.over:
         check(design.base)
-        _check_counts(design.base)
         check_installed(design.base)
         return
     check_each(design.base)
@@ -132,18 +128,7 @@ def check_design(design: Design) -> None:
         raise ValueError(f"--chunk-runs must be at least 1, got {design.chunk_runs}")
     check_over(design.base, design.over)
     _check_results(design)
-    for config in configure(design.base, design.configurations(), design.given):
-        _check_counts(config)
-
-
-def _check_counts(config: Config) -> None:
-    """Raises ValueError for numbers of things that no memory holds."""
-    large = (*marked(Range.COUNTED), *marked(Range.SEED))
-    for name, value in vars(config).items():
-        numbers = value if isinstance(value, tuple) else (value,)
-        most = max((x for x in numbers if isinstance(x, int)), default=0)
-        if name not in large and most > MAX_OF_UPDATE:
-            raise ValueError(f"{flag(name)} must be less than 2^31, got {most}")
+    configure(design.base, design.configurations(), design.given)
 
 
 def _check_results(design: Design) -> None:

@@ -27,8 +27,7 @@ from mjx_reinforce.training import resume
 from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.division import Division, divide_run
 from mjx_reinforce.training.record import Runs
-from mjx_reinforce.training.slots import StateRows
-from mjx_reinforce.training.state import last_actors
+from mjx_reinforce.training.state import StateRows, last_actors
 
 
 class Group(NamedTuple):

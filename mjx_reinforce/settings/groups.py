@@ -96,7 +96,7 @@ class RunSettings:
     """reinforce follows the policy gradient; ars (augmented random search, Mania et al. 2018) tries
     out changes of the parameters, with the numbers of mjx_reinforce.ars. A preset's name is its
     program, without the preset's settings. Or module:name."""
-    num_seeds: int = setting(4, Range.AT_LEAST_1, once="every configuration has as many seeds")
+    num_seeds: int = setting(4, *COUNT, once="every configuration has as many seeds")
     """Number of independent seeds, trained together in one compiled program."""
     seeds: str | None = setting(
         None, Mark.NOT_COMPILED, once="every configuration has the same seeds"

@@ -10,25 +10,22 @@ import dataclasses
 import hashlib
 import importlib
 import json
-from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
 from mjx_reinforce import envs
-from mjx_reinforce.engine.base import PyTree, is_key, plain
+from mjx_reinforce.engine.base import PyTree, is_key
 from mjx_reinforce.engine.cache import Cache
 from mjx_reinforce.envs.settings import split_words
-from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.registry import is_own
 from mjx_reinforce.settings.config import CODE, Config, marked
 from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.store.provenance import provenance, version
-from mjx_reinforce.training.block import Block
 from mjx_reinforce.training.programs import Programs
 from mjx_reinforce.training.resume import recordable
-from mjx_reinforce.training.state import Budget, RunState, restored
+from mjx_reinforce.training.state import Budget, StateRows
 
 _PROGRAMS = ("begin", "advance", "evaluate")
 
@@ -77,22 +74,21 @@ def keep(key: str, facts: dict[str, Any], programs: Programs) -> Programs:
     except TypeError:
         return programs
     cache.write(f"{key}-facts", json.dumps(whole).encode())
-    leaves = jax.tree.leaves(jax.eval_shape(plain, like))
-    actor, keys = jax.tree.leaves(like.train_states.actor), jax.eval_shape(plain, like.eval_keys)
-    seed, numbers, count = (jax.ShapeDtypeStruct(x, np.uint32) for x in ((), keys.shape[:1], (2,)))
-    which = jax.ShapeDtypeStruct(numbers.shape, bool)
+    width = len(like.eval_keys)
+    seed, numbers, count = (jax.ShapeDtypeStruct(x, np.uint32) for x in ((), (width,), (2,)))
+    rows = jax.ShapeDtypeStruct((width, StateRows(like).size), np.uint8)
+    which, look = (jax.ShapeDtypeStruct(x, bool) for x in ((width,), ()))
     given = {
-        "begin": (seed, numbers),
-        "advance": (leaves, (count,) * len(Budget._fields), which),
-        "evaluate": (actor, keys, which),
+        "begin": (seed, numbers, {}),  # a run has no settings that are traced
+        "advance": (rows, (count,) * len(Budget._fields), which, look),
+        "evaluate": (rows, which),
     }
-    flat = _on_leaves(programs)
-
-    def load(name: str) -> Callable[..., Any]:
-        return cache.keep(f"{key}-{name}", flat[name], given[name])
-
-    kept = _on_states(load, like, programs.rides)
-    return kept._replace(division=programs.division)
+    return programs._replace(
+        **{
+            name: cache.keep(f"{key}-{name}", getattr(programs, name), given[name])
+            for name in _PROGRAMS
+        }
+    )
 
 
 def read_programs(key: str) -> tuple[dict[str, Any], Programs] | None:
@@ -106,49 +102,8 @@ def read_programs(key: str) -> tuple[dict[str, Any], Programs] | None:
     if len(loaded) < len(found):
         return None
     whole = json.loads(facts)
-    like = rebuild(whole["like"])
-    return whole["facts"], _on_states(loaded.__getitem__, like, whole["rides"])
-
-
-def _on_leaves(programs: Programs) -> dict[str, Callable[..., Any]]:
-    """Returns the programs of a run on lists of leaves, with data in the place of keys.
-
-    They are kept so: JAX exports no class of this package.
-    """
-    like = programs.like
-
-    def begin(seed: jax.Array, numbers: jax.Array) -> Any:
-        first, keys = programs.begin(seed, numbers, {})
-        return jax.tree.leaves(plain(first)), plain(keys)
-
-    def advance(leaves: list[jax.Array], budget: Sequence[jax.Array], look: jax.Array) -> Any:
-        after, block = programs.advance(restored(leaves, like), Budget(*budget), look)
-        return jax.tree.leaves(plain(after)), tuple(block)
-
-    def evaluate(
-        leaves: list[jax.Array], keys: jax.Array, which: jax.Array
-    ) -> dict[str, jax.Array]:
-        actor = restored(leaves, like.train_states.actor)
-        return programs.evaluate(actor, jax.random.wrap_key_data(keys), which)
-
-    return {"begin": begin, "advance": advance, "evaluate": evaluate}
-
-
-def _on_states(load: Callable[[str], Callable[..., Any]], like: RunState, rides: bool) -> Programs:
-    """Returns the programs of which ``load`` returns those on leaves, when they are traced."""
-
-    def begin(*given: jax.Array) -> tuple[RunState, jax.Array]:
-        leaves, keys = load("begin")(*given[:2])  # a run has no settings that are traced
-        return restored(leaves, like), jax.random.wrap_key_data(keys)
-
-    def advance(before: RunState, budget: Budget, look: jax.Array) -> tuple[RunState, Block]:
-        leaves, block = load("advance")(jax.tree.leaves(plain(before)), tuple(budget), look)
-        return restored(leaves, like), Block(*block)
-
-    def evaluate(actor: Actor, keys: jax.Array, which: jax.Array) -> dict[str, jax.Array]:
-        return load("evaluate")(jax.tree.leaves(actor), plain(keys), which)
-
-    return Programs(begin, advance, evaluate, rides, like)
+    programs = (loaded[name] for name in _PROGRAMS)
+    return whole["facts"], Programs(*programs, rides=whole["rides"], like=rebuild(whole["like"]))
 
 
 #: The packages whose classes a description may name.

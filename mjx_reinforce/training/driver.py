@@ -14,8 +14,8 @@ from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.record import Cells, Record, RunRecord
 from mjx_reinforce.training.resume import recordable
-from mjx_reinforce.training.slots import Measured, Slots, StateRows
-from mjx_reinforce.training.state import Best, first_best, keep_best
+from mjx_reinforce.training.slots import Measured, Slots
+from mjx_reinforce.training.state import Best, StateRows, first_best, keep_best
 
 
 class Evaluation(NamedTuple):

@@ -1,48 +1,49 @@
 """The programs that move runs on side by side; ``slots`` compiles them."""
 
-from collections.abc import Callable, Collection
-from typing import NamedTuple
+import dataclasses
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.engine.base import Environment
+from mjx_reinforce.engine.base import Environment, plain
+from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.learning.policy import Actor
-from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.training import state
 from mjx_reinforce.training.block import (
-    Block,
     BuildLearner,
     block_of_updates,
     evaluate,
     evaluation_episodes,
 )
 from mjx_reinforce.training.division import ALONE, Division
-from mjx_reinforce.training.state import Budget, RunState, Seed
+from mjx_reinforce.training.state import Budget, RunState, Seed, StateRows
 from mjx_reinforce.training.wrappers import EvaluationEpisodes, SharedLaunch
 
 
 class Programs(NamedTuple):
-    """The programs of R runs before they are compiled.
+    """The programs of R runs before they are compiled. States are rows [R, B], see ``StateRows``.
 
     What differs from sweep to sweep without another program is their input: seeds, budgets, and
     the settings that are traced.
 
-    begin: (seed, the numbers [R] of the runs' seeds, settings [R] each) -> the first
-      ``RunState``, and the keys [K, R] of the last test, which plays the episodes of K evaluations
-    advance: (RunState, ``Budget``, whether to evaluate [R]) -> as ``block_of_updates``
-    evaluate: (Actor [R, ...], keys [R], whether to [R]) -> what
-      ``block.evaluate`` returns, [R] each
+    begin: (seed, the numbers [R] of the runs' seeds, settings [R] each) -> the first states, and
+      the data of the keys [K, R] of the last test, which plays the episodes of K evaluations
+    advance: (states, the parts of a ``Budget``, which rows have a run [R], whether to evaluate [])
+      -> (states, metrics [K, R] each, what was evaluated [R] each), as in ``block.Block``
+    evaluate: (states, whether to [R]) -> what ``block.evaluate`` returns, [R] each
     rides: whether ``advance`` evaluates; else ``evaluate`` does, before it
     like: the shapes of a ``RunState``
     division: among which devices the runs are divided; R are those of one device
     """
 
-    begin: Callable[..., tuple[RunState, jax.Array]]
-    advance: Callable[[RunState, Budget, jax.Array], tuple[RunState, Block]]
-    evaluate: Callable[[Actor, jax.Array, jax.Array], dict[str, jax.Array]]
+    begin: Callable[..., tuple[jax.Array, jax.Array]]
+    advance: Callable[..., tuple[jax.Array, dict[str, jax.Array], dict[str, jax.Array]]]
+    evaluate: Callable[..., dict[str, jax.Array]]
     rides: bool
     like: RunState
     division: Division = ALONE
@@ -83,16 +84,17 @@ def programs_of(
         return build_learner(settings).init(key)
 
     # One program, whatever the seeds are: a program for each operation on keys takes longer.
-    def begin(
-        seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]
-    ) -> tuple[RunState, jax.Array]:
+    def states(seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]) -> RunState:
         keys = state.seed_keys(seed, numbers)
-        states = RunState(
+        return RunState(
             train_states=jax.vmap(first)(keys, settings),
             eval_keys=state.eval_keys(numbers),
             settings=settings,
         )
-        return states, state.last_test_keys(numbers, config)
+
+    def begin(seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]) -> Any:
+        rows = layout.traced_rows(states(seed, numbers, settings))
+        return rows, plain(state.last_test_keys(numbers, config))
 
     def visit(key: jax.Array, active: jax.Array) -> EvaluationEpisodes:
         return evaluation_episodes(
@@ -103,19 +105,27 @@ def programs_of(
         size = {"num_episodes": config.eval_episodes, "horizon": horizon}
         return evaluate(env, learner, actor, key, **size, active=active, sampled=whole)
 
+    def look_at(rows: jax.Array, which: jax.Array) -> dict[str, jax.Array]:
+        now = layout.traced_states(rows)
+        return jax.vmap(look)(now.train_states.actor, now.eval_keys, which)
+
     updates = block_of_updates(build_learner, config.block_length, visit if rides else None)
 
-    def counted(before: RunState, budget: Budget, look: jax.Array) -> tuple[RunState, Block]:
-        after, block = updates(before, budget, look)
-        return after, block._replace(metrics={name: block.metrics[name] for name in _COUNTED})
+    def advance(
+        rows: jax.Array, budget: Sequence[jax.Array], which: jax.Array, look: jax.Array
+    ) -> Any:
+        before = layout.traced_states(rows)
+        # A row without a run has no budget.
+        played = before.train_states.env_steps
+        played = jnp.where(which[:, None], played, counts.from_int(MAX_COUNT))
+        train_states = dataclasses.replace(before.train_states, env_steps=played)
+        before = dataclasses.replace(before, train_states=train_states)
+        after, (_, metrics, looked) = updates(before, Budget(*budget), which & look)
+        measured = metrics if whole else {name: metrics[name] for name in _COUNTED}
+        return layout.traced_rows(after), measured, looked
 
     numbers = jax.ShapeDtypeStruct((num_runs,), np.uint32)
     settings = {name: jax.ShapeDtypeStruct((num_runs,), jnp.result_type(float)) for name in traced}
-    return Programs(
-        begin=begin,
-        advance=updates if whole else counted,
-        evaluate=jax.vmap(look),
-        rides=rides,
-        like=jax.eval_shape(begin, np.uint32(0), numbers, settings)[0],
-        division=division,
-    )
+    like = jax.eval_shape(states, np.uint32(0), numbers, settings)
+    layout = StateRows(like)
+    return Programs(begin, advance, look_at, rides, like, division)

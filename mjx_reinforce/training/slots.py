@@ -12,94 +12,23 @@ costs as much to choose, to send and to fetch as all of them in one array.
 
 import dataclasses
 import functools
-import hashlib
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
-from mjx_reinforce.engine.base import PyTree, plain, with_keys
 from mjx_reinforce.engine.devices import NONE, RUNS, SECOND, executable
 from mjx_reinforce.files import Arrays
-from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.policy import Actor
-from mjx_reinforce.settings.config import MAX_COUNT, Config
+from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import num_cores
 from mjx_reinforce.training.memory import check_fits, check_room
 from mjx_reinforce.training.programs import Programs
-from mjx_reinforce.training.state import Budget, RunState, Seed, budget_of, shape_of_all
-
-
-class StateRows:
-    """Writes the states of runs as rows [R, B] of bytes, and reads them; no bit changes."""
-
-    def __init__(self, like: PyTree):
-        """Takes the states of any number of runs, or their shapes."""
-        self._like = like
-        leaves, self._structure = jax.tree.flatten(jax.eval_shape(plain, like))
-        self._shapes = [leaf.shape[1:] for leaf in leaves]
-        self._types = [np.dtype(leaf.dtype) for leaf in leaves]
-        sizes = [
-            int(np.prod(shape)) * kind.itemsize
-            for shape, kind in zip(self._shapes, self._types, strict=True)
-        ]
-        *self._ends, self.size = np.cumsum(sizes).tolist()
-
-    @property
-    def layout(self) -> str:
-        """What is in a row, in short: rows of another layout are others' states."""
-        known = repr((self._structure, self._shapes, self._types))
-        return hashlib.sha256(known.encode()).hexdigest()
-
-    def rows(self, states: PyTree) -> np.ndarray:
-        """Returns the rows of states, on the host."""
-        leaves = map(np.ascontiguousarray, jax.tree.leaves(jax.device_get(plain(states))))
-        return np.concatenate([_flat(leaf).view(np.uint8) for leaf in leaves], axis=1)
-
-    def states(self, rows: np.ndarray) -> Any:
-        """Returns the states of rows, on the host in memory of their own, and their keys."""
-        parts = (part.copy() for part in np.split(rows, self._ends, axis=1))
-        return self._shaped(part.view(kind) for part, kind in zip(parts, self._types, strict=True))
-
-    def traced_rows(self, states: PyTree) -> jax.Array:
-        """Returns the rows of states, in a program."""
-
-        def as_bytes(leaf: jax.Array) -> jax.Array:
-            if leaf.dtype.itemsize == 1:
-                return _flat(leaf.astype(jnp.uint8))
-            return _flat(lax.bitcast_convert_type(leaf, jnp.uint8))
-
-        return jnp.concatenate([as_bytes(leaf) for leaf in jax.tree.leaves(plain(states))], axis=1)
-
-    def traced_states(self, rows: jax.Array) -> Any:
-        """Returns the states of rows, in a program."""
-
-        def read(part: jax.Array, kind: np.dtype) -> jax.Array:
-            if kind.itemsize == 1:
-                return part.astype(kind)
-            numbers = part.reshape(len(part), part.shape[1] // kind.itemsize, kind.itemsize)
-            return lax.bitcast_convert_type(numbers, kind)
-
-        parts = jnp.split(rows, self._ends, axis=1)
-        return self._shaped(read(*each) for each in zip(parts, self._types, strict=True))
-
-    def _shaped(self, leaves: Iterable[np.ndarray] | Iterable[jax.Array]) -> Any:
-        """Returns states of leaves [R, numbers], which have the data of keys."""
-        shaped = [
-            leaf.reshape(len(leaf), *shape)
-            for leaf, shape in zip(leaves, self._shapes, strict=True)
-        ]
-        return with_keys(jax.tree.unflatten(self._structure, shaped), self._like)
-
-
-def _flat(leaf: PyTree) -> Any:
-    """Returns a leaf as [R, numbers]."""
-    return leaf.reshape(len(leaf), int(np.prod(leaf.shape[1:])))
+from mjx_reinforce.training.state import Budget, RunState, StateRows, budget_of, shape_of_all
 
 
 def pack_slots(
@@ -269,7 +198,7 @@ class Slots:
         """
         lanes, programs = self._pack(chosen, lengths)
         count = most if lanes.shape == (1, min(self._compiled.slots)) else 1
-        budget = self._division.put(self.budget, NONE)
+        budget = self._division.put(tuple(self.budget), NONE)
 
         def move(runs: np.ndarray) -> Any:
             slot, which = self._put(runs), self._division.put(runs >= 0)
@@ -387,7 +316,7 @@ def compile_slots(
       ValueError: even the narrowest slot does not fit into memory.
     """
     layout = StateRows(programs.like)
-    begin = started(functools.partial(_compile_begin, programs, layout, widths[0]))
+    begin = started(functools.partial(_compile_begin, programs, widths[0]))
     widest = started(_trace_slot(programs, layout, widths[0]))
     slots = {widths[0]: widest}
     for width in widths[1:]:
@@ -417,47 +346,27 @@ def compile_run(
     return Slots(compiled, config.first_seed + np.arange(config.num_seeds))
 
 
-def _compile_begin(programs: Programs, layout: StateRows, width: int) -> Callable[..., Any]:
+def _compile_begin(programs: Programs, width: int) -> Callable[..., Any]:
     """Compiles ``Compiled.begin``."""
-
-    def begin(seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]) -> Any:
-        states, test_keys = programs.begin(seed, numbers, settings)
-        return layout.traced_rows(states), plain(test_keys)
-
     division = programs.division
     seed = division.shapes(jax.ShapeDtypeStruct((), np.uint32), NONE)
     numbers = jax.ShapeDtypeStruct((width,), np.uint32)
     given = division.shapes((numbers, shape_of_all(programs.like, width).settings), RUNS)
-    program = division.jit(begin, (NONE, RUNS, RUNS), (RUNS, SECOND))
+    program = division.jit(programs.begin, (NONE, RUNS, RUNS), (RUNS, SECOND))
     return executable(program.lower(seed, *given))
 
 
 def _trace_slot(programs: Programs, layout: StateRows, width: int) -> Callable[[], Slot]:
     """Traces what moves slots of ``width`` runs; returns what waits until it is compiled."""
-
-    def advance(rows: jax.Array, budget: Budget, which: jax.Array, look: jax.Array) -> Any:
-        before = layout.traced_states(rows)
-        # A lane without a run has no budget.
-        played = before.train_states.env_steps
-        played = jnp.where(which[:, None], played, counts.from_int(MAX_COUNT))
-        train_states = dataclasses.replace(before.train_states, env_steps=played)
-        before = dataclasses.replace(before, train_states=train_states)
-        after, block = programs.advance(before, budget, which & look)
-        return layout.traced_rows(after), block.metrics, block.looked
-
-    def evaluate(rows: jax.Array, which: jax.Array) -> dict[str, jax.Array]:
-        states = layout.traced_states(rows)
-        return programs.evaluate(states.train_states.actor, states.eval_keys, which)
-
     division = programs.division
     check_room(2.0 * width * layout.size)
     rows, which = division.put((np.zeros((width, layout.size), np.uint8), np.zeros(width, bool)))
-    nothing, no_look = division.put((Budget.of(0, 0), np.bool_(False)), NONE)
+    nothing, no_look = division.put((tuple(Budget.of(0, 0)), np.bool_(False)), NONE)
     given = rows, nothing, which, no_look
     specs = (RUNS, NONE, RUNS, NONE), (RUNS, SECOND, RUNS)
-    looking = division.jit(evaluate, (RUNS, RUNS), RUNS).lower(rows, which)
+    looking = division.jit(programs.evaluate, (RUNS, RUNS), RUNS).lower(rows, which)
     evaluating = started(functools.partial(executable, looking))
-    updating = division.jit(advance, *specs, by_episodes=True).lower(*given)
+    updating = division.jit(programs.advance, *specs, by_episodes=True).lower(*given)
     advancing = started(functools.partial(executable, updating))
 
     def wait() -> Slot:

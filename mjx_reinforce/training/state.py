@@ -1,7 +1,8 @@
 """The states of runs side by side, and what they begin with: keys, a budget, policies."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import hashlib
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,8 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax import lax
 
-from mjx_reinforce.engine.base import PyTree, with_keys
+from mjx_reinforce.engine.base import PyTree, plain, with_keys
 from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.learning.policy import Actor
@@ -59,9 +61,71 @@ def shape_of_all(like: RunState, num_runs: int) -> RunState:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_runs, *x.shape[1:]), x.dtype), like)
 
 
-def restored(leaves: Sequence[jax.Array | np.ndarray], like: PyTree) -> Any:
-    """Returns a pytree like another of plain leaves; its keys are keys again."""
-    return with_keys(jax.tree.unflatten(jax.tree.structure(like), leaves), like)
+class StateRows:
+    """Writes the states of runs as rows [R, B] of bytes, and reads them; no bit changes."""
+
+    def __init__(self, like: PyTree):
+        """Takes the states of any number of runs, or their shapes."""
+        self._like = like
+        leaves, self._structure = jax.tree.flatten(jax.eval_shape(plain, like))
+        self._shapes = [leaf.shape[1:] for leaf in leaves]
+        self._types = [np.dtype(leaf.dtype) for leaf in leaves]
+        sizes = [
+            int(np.prod(shape)) * kind.itemsize
+            for shape, kind in zip(self._shapes, self._types, strict=True)
+        ]
+        *self._ends, self.size = np.cumsum(sizes).tolist()
+
+    @property
+    def layout(self) -> str:
+        """What is in a row, in short: rows of another layout are others' states."""
+        known = repr((self._structure, self._shapes, self._types))
+        return hashlib.sha256(known.encode()).hexdigest()
+
+    def rows(self, states: PyTree) -> np.ndarray:
+        """Returns the rows of states, on the host."""
+        leaves = map(np.ascontiguousarray, jax.tree.leaves(jax.device_get(plain(states))))
+        return np.concatenate([_flat(leaf).view(np.uint8) for leaf in leaves], axis=1)
+
+    def states(self, rows: np.ndarray) -> Any:
+        """Returns the states of rows, on the host in memory of their own, and their keys."""
+        parts = (part.copy() for part in np.split(rows, self._ends, axis=1))
+        return self._shaped(part.view(kind) for part, kind in zip(parts, self._types, strict=True))
+
+    def traced_rows(self, states: PyTree) -> jax.Array:
+        """Returns the rows of states, in a program."""
+
+        def as_bytes(leaf: jax.Array) -> jax.Array:
+            if leaf.dtype.itemsize == 1:
+                return _flat(leaf.astype(jnp.uint8))
+            return _flat(lax.bitcast_convert_type(leaf, jnp.uint8))
+
+        return jnp.concatenate([as_bytes(leaf) for leaf in jax.tree.leaves(plain(states))], axis=1)
+
+    def traced_states(self, rows: jax.Array) -> Any:
+        """Returns the states of rows, in a program."""
+
+        def read(part: jax.Array, kind: np.dtype) -> jax.Array:
+            if kind.itemsize == 1:
+                return part.astype(kind)
+            numbers = part.reshape(len(part), part.shape[1] // kind.itemsize, kind.itemsize)
+            return lax.bitcast_convert_type(numbers, kind)
+
+        parts = jnp.split(rows, self._ends, axis=1)
+        return self._shaped(read(*each) for each in zip(parts, self._types, strict=True))
+
+    def _shaped(self, leaves: Iterable[np.ndarray] | Iterable[jax.Array]) -> Any:
+        """Returns states of leaves [R, numbers], which have the data of keys."""
+        shaped = [
+            leaf.reshape(len(leaf), *shape)
+            for leaf, shape in zip(leaves, self._shapes, strict=True)
+        ]
+        return with_keys(jax.tree.unflatten(self._structure, shaped), self._like)
+
+
+def _flat(leaf: PyTree) -> Any:
+    """Returns a leaf as [R, numbers]."""
+    return leaf.reshape(len(leaf), int(np.prod(leaf.shape[1:])))
 
 
 class Best(struct.PyTreeNode, kw_only=True):

@@ -26,7 +26,6 @@ from saved_runs import make_run
 from toys import Survive
 
 from mjx_reinforce import ars, envs, reinforce
-from mjx_reinforce import train as train_module
 from mjx_reinforce.console import jax_setup
 from mjx_reinforce.registry import ESTIMATORS
 from mjx_reinforce.runs import display
@@ -114,7 +113,8 @@ def test_settings_that_would_do_nothing_are_refused(reader):
 @pytest.fixture
 def refused(run, monkeypatch, tmp_path, capsys):
     """Runs a command line that must be refused, and returns what it said."""
-    monkeypatch.setattr(train_module, "train", lambda *_: pytest.fail("it was not refused"))
+    refused = "mjx_reinforce.runs.conduct.compile_slots"
+    monkeypatch.setattr(refused, lambda *_: pytest.fail("it was not refused"))
 
     def refuse(*arguments):
         before = sorted(tmp_path.rglob("*"))

@@ -34,7 +34,7 @@ from mjx_reinforce.store.build import build
 from mjx_reinforce.training import checkpoint, driver, slots
 from mjx_reinforce.training.division import ALONE
 from mjx_reinforce.training.programs import programs_of
-from mjx_reinforce.training.state import eval_keys
+from mjx_reinforce.training.state import StateRows
 
 
 class CrashError(Exception):
@@ -513,11 +513,14 @@ def test_the_policies_of_the_best_and_the_worst_seed_are_kept(run):
         config = Config(env="Drift-v0", num_seeds=5, eval_episodes=2, hidden_sizes=(4,))
         learner, horizon = build(env, config)
         made = programs_of(env, lambda _, x=learner: x, horizon, config, 1, whole=False)
-        evaluate = jax.jit(made.evaluate)
+        evaluate, layout = jax.jit(made.evaluate), StateRows(made.like)
         for seed in known.seeds:
             actor = jax.tree.map(lambda x: x[None], load_seed(known, seed)[0].actor)
-            keys = eval_keys(np.array([seed], np.uint32))
-            returns = evaluate(actor, keys, np.ones(1, bool))["eval_return"]
+            rows, _ = jax.jit(made.begin)(0, np.array([seed], np.uint32), {})
+            states = layout.states(np.asarray(rows))
+            trained = states.train_states.replace(actor=actor)
+            rows = layout.rows(states.replace(train_states=trained))
+            returns = evaluate(rows, np.ones(1, bool))["eval_return"]
             np.testing.assert_array_equal(returns[0], final[seeds == seed][0])
     with pytest.raises(ValueError, match="has the policies of the seeds"):
         load_seed(read_run(Path("swept/policies/000")), 99)

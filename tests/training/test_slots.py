@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce.training.slots import StateRows, Stopwatch, _of_slots, pack_slots, started
+from mjx_reinforce.training.slots import Stopwatch, _of_slots, pack_slots, started
+from mjx_reinforce.training.state import StateRows
 
 
 @pytest.mark.parametrize("num_devices", [1, 2, 8])
