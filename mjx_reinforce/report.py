@@ -138,7 +138,7 @@ def _beside(output: Path) -> Path:
 
 
 def results_csv(findings: Findings) -> str:
-    """Returns a row for each configuration and seed, as ``results.csv`` of a sweep."""
+    """Returns a row for each configuration and seed."""
     names = swept(findings)
     header = ("configuration", *names, "seed", "final_return", "best_return")
     lines: list[Sequence[Any]] = [(*header, "env_steps_to_solve", "env_steps", "nonfinite")]

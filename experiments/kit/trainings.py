@@ -91,7 +91,6 @@ def results(directory: Path) -> dict[str, object]:
 def _of_sweep(directory: Path) -> dict[str, object]:
     policies = sorted(directory.glob("policies/*/policy/actor.npz"))
     return {
-        "results.csv": (directory / "results.csv").read_bytes(),
         "curves.npz": _arrays(directory / "curves.npz"),
         "policies": [path.read_bytes() for path in policies],
         "sweep.json": _without_clocks(directory / "sweep.json"),

@@ -36,12 +36,12 @@ _OWN = (
 _TIMINGS = ("compile_seconds", "run_seconds", "statistics_seconds")
 #: The columns and arrays that are read, and their types.
 _METRICS = {"seed": np.int64, "env_steps": np.int64, "eval_return": np.float64}
-_RESULTS = {"configuration": np.int64, "seed": np.int64, "nonfinite": np.int64}
 _CURVES = {
     "configuration": np.int64,
     "seed": np.int64,
     "eval_return": np.float64,
     "env_steps": np.int64,
+    "nonfinite": np.int64,
 }
 #: Those of a configuration.
 _COLUMNS = ("seed", "eval_return", "env_steps", "nonfinite")
@@ -298,20 +298,15 @@ def _outcome(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _read_curves(directory: Path) -> dict[str, np.ndarray]:
-    """Returns the arrays of curves.npz, [R] or [E, R] of R runs, and ``nonfinite`` [R] of them."""
-    path, results = directory / "curves.npz", directory / "results.csv"
-    arrays, rows = read_arrays(path), read_columns(results, _RESULTS)
+    """Returns the arrays of curves.npz, [R] or [E, R] of R runs."""
+    path = directory / "curves.npz"
+    arrays = read_arrays(path)
     with naming_damage(path):
         found = {name: arrays[name].astype(kind) for name, kind in _CURVES.items()}
         shapes = {name: x.shape[-1:] for name, x in found.items()}
         if len({*shapes.values()}) > 1 or len(found["eval_return"]) != len(found["env_steps"]):
             raise ValueError(f"its arrays are of different runs: {shapes}")
-    row_of, run_of = (
-        [*zip(x["configuration"].tolist(), x["seed"].tolist(), strict=True)] for x in (rows, found)
-    )
-    with naming_damage(results):
-        counted = dict(zip(row_of, rows["nonfinite"], strict=True))
-        return found | {"nonfinite": np.array([counted[run] for run in run_of], np.int64)}
+        return found
 
 
 def read_metrics(path: Path, first: int = 0) -> dict[str, np.ndarray]:

@@ -57,9 +57,9 @@ _TRAIN = _Program(
     GROUPS,
 )
 _SWEEP = _Program(
-    "Train many configurations, many seeds of each, side by side. Leaves sweep.json, results.csv "
-    "(a row for each configuration and seed), curves.npz, report.html and policies/ (those of the "
-    "best and the worst seed of each configuration) in the output directory. "
+    "Train many configurations, many seeds of each, side by side. Leaves sweep.json, curves.npz, "
+    "report.html, report/results.csv (a row for each configuration and seed) and policies/ (those "
+    "of the best and the worst seed of each configuration) in the output directory. "
     "All settings of python -m mjx_reinforce.train may be given, with its presets, and most may be "
     "swept. Seed 3 of a configuration is seed 3 of train with these settings, up to rounding.",
     {"sweep": SweepSettings, **GROUPS},

@@ -27,7 +27,7 @@ from mjx_reinforce.settings.config import (
 from mjx_reinforce.settings.groups import LogSettings
 from mjx_reinforce.training.resume import PLACES, as_config, read_record
 
-#: What writing results.csv and curves.npz needs for a run with two evaluations (bytes).
+#: What writing curves.npz and a report needs for a run with two evaluations (bytes).
 _RESULT = 760
 
 
@@ -132,7 +132,7 @@ def check_design(design: Design) -> None:
 
 
 def _check_results(design: Design) -> None:
-    """Raises ValueError where memory does not hold what results.csv is made of."""
+    """Raises ValueError where memory does not hold what a sweep measures."""
     runs = design.count() * design.base.num_seeds
     if runs * _RESULT > host_memory():
         raise ValueError(
@@ -207,7 +207,7 @@ def check_over(base: Config, over: Mapping[str, Sequence[Any]]) -> None:
     for field in dataclasses.fields(LogSettings):
         if getattr(base, field.name):
             raise ValueError(
-                f"{flag(field.name)} logs a run; leave it out: a sweep writes results.csv"
+                f"{flag(field.name)} logs a run; leave it out: a sweep writes curves.npz"
             )
     for name, values in over.items():
         if own := _of_env(name):

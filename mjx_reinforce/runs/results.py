@@ -170,6 +170,7 @@ class SweepResults(NamedTuple):
       seed: [R]
       eval_return: [E, R] mean return of the policy's mode; NaN where it was not finite
       env_steps: [E, R] trained until then
+      nonfinite: [R] updates that met numbers which are not finite
 
     Examples:
       >>> import dataclasses
@@ -188,6 +189,7 @@ class SweepResults(NamedTuple):
     seed: np.ndarray
     eval_return: np.ndarray
     env_steps: np.ndarray
+    nonfinite: np.ndarray
 
 
 def sweep(

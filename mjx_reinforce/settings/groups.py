@@ -262,7 +262,7 @@ class LogSettings:
     """
 
     log: tuple[Literal["tensorboard", "wandb"], ...] = setting(
-        (), Mark.NOT_COMPILED, once="its rows are in results.csv"
+        (), Mark.NOT_COMPILED, once="what it measures is in curves.npz"
     )
     """Of each column the interquartile mean, quantiles and the first 16 seeds. tensorboard: charts
     in RUN/tensorboard; to see them, pip install tensorboard, then tensorboard --logdir RUN. wandb:

@@ -1,6 +1,5 @@
-"""Sweep directories as `sweeps/` writes them, of curves drawn from a formula: nobody trained."""
+"""Sweep directories as `runs/` writes them, of curves drawn from a formula: nobody trained."""
 
-import csv
 import itertools
 import json
 
@@ -31,17 +30,8 @@ def make_sweep(directory, *, num_seeds=12, evaluations=20, over=GRID, **changes)
         seed=seed,
         eval_return=returns,
         env_steps=steps,
+        nonfinite=np.isnan(returns).sum(axis=0, dtype=np.int32),
     )
-    with (directory / "results.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        names = ("final_return", "best_return", "env_steps_to_solve", "env_steps", "nonfinite")
-        writer.writerow(("configuration", *over, "seed", *names))
-        for row, (i, s) in enumerate(zip(configuration, seed, strict=True)):
-            curve, at = returns[:, row], steps[:, row]
-            solved = np.flatnonzero(curve >= THRESHOLD)
-            results = (curve[-1], np.fmax.reduce(curve), at[solved[0]] if len(solved) else "")
-            broken = int(np.isnan(curve).sum())
-            writer.writerow((i, *named[i].values(), s, *results, at[-1], broken))
     content = {
         "status": "finished",
         "env": "InvertedPendulum-v5",

@@ -112,17 +112,16 @@ ARRAYS = {
     "seed": np.array([0, 0, 1]),
     "eval_return": np.arange(6, dtype=np.float32).reshape(2, 3),
     "env_steps": 10 * np.arange(6).reshape(2, 3),
+    "nonfinite": np.array([4, 3, 5]),
 }
-RESULTS = "configuration,seed,nonfinite\n0,0,3\n1,0,4\n1,1,5\n"
 
 
 @pytest.fixture
 def sweep(tmp_path):
     """Returns a function that writes a sweep, with other parts."""
 
-    def write(results=RESULTS, content=CONTENT, **arrays):
+    def write(content=CONTENT, **arrays):
         (tmp_path / "sweep.json").write_text(json.dumps(content))
-        (tmp_path / "results.csv").write_text(results)
         whole = {k: x for k, x in (ARRAYS | arrays).items() if x is not None}
         np.savez(tmp_path / "curves.npz", **whole)
         return tmp_path
@@ -165,7 +164,6 @@ def test_a_damaged_sweep_json_is_named(sweep, change, message):
         ({"seed": np.array(["a", "b", "c"])}, "curves.npz is damaged: invalid literal .*'a'"),
         ({"seed": np.zeros(2, int)}, "curves.npz is damaged: its arrays .*'seed': .2,"),
         ({"env_steps": np.zeros((1, 3))}, "curves.npz is damaged: its arrays"),
-        ({"seed": np.array([0, 0, 2])}, "results.csv is damaged: .1, 2. is miss"),
     ],
 )
 def test_damaged_curves_are_named(sweep, arrays, message):

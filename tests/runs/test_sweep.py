@@ -109,19 +109,11 @@ def test_the_files_and_the_screen_say_what_was_measured(run, capsys):
         for layers in ("none", "3-3")
     ]
     assert all(said[i + 1].startswith("update ") for i in headings)
-    rows = list(csv.DictReader(Path("swept/results.csv").read_text().splitlines()))
-    assert [(row["configuration"], row["seed"]) for row in rows] == [
-        (str(c), str(s)) for c in range(6) for s in range(2)
-    ]
-    assert [rows[0]["hidden_sizes"], rows[-1]["hidden_sizes"]] == ["none", "3,3"]
     measured = curves(Path("swept"))
-    final = measured["eval_return"][-1]
-    assert np.allclose([float(row["final_return"]) for row in rows], final, equal_nan=True)
-    assert [int(row["env_steps"]) for row in rows] == measured["env_steps"][-1].tolist()
-    for index, row in enumerate(rows):
-        solved = np.flatnonzero(measured["eval_return"][:, index] >= Drift.reward_threshold)
-        expected = str(measured["env_steps"][solved[0], index]) if len(solved) else ""
-        assert row["env_steps_to_solve"] == expected
+    assert [*zip(measured["configuration"], measured["seed"], strict=True)] == [
+        (c, s) for c in range(6) for s in range(2)
+    ]
+    assert not measured["nonfinite"].any()
     said = json.loads(Path("swept/sweep.json").read_text())
     assert said["status"] == "finished"
     assert said["configurations"][4] == {
@@ -139,7 +131,6 @@ def test_an_exact_run_does_not_depend_on_the_others(run):
     assert run(f"{command} --num-seeds 3 {RATES} --output whole") == 0
     more = "--over learning-rate 3e-2 1e-1 --over discount 0.9 0.99 --chunk-runs 2 --seeds 1:3"
     assert run(f"{command} {more} --output share") == 0
-    assert len(list(Path("share/parts").glob("*.npz"))) == 4
     whole, share = read_results(Path("whole")), read_results(Path("share"))
     assert set(share.seed.tolist()) == {1, 2}
     for one, other in ((1, 1), (2, 3)):  # 0.99 is the default discount
@@ -278,7 +269,7 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
     """
     monkeypatch.setattr(plan, "_CPU_EPISODES", (16, 4))
     drive, driven, ended, tried = driver.drive, [], [], []
-    add, save, write = SweepFiles._add, SweepFiles._save_checkpoint, checkpoint.save
+    add, save, write = SweepFiles._write_part, SweepFiles._save_checkpoint, checkpoint.save
 
     def interrupted(*arguments):
         driven.append(None)
@@ -304,7 +295,10 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
         patch.setattr(driver, "drive", interrupted)
         assert run(f"{CHUNKS} --output parts") == 0
     assert json.loads(Path("parts/sweep.json").read_text())["status"] == "interrupted"
-    for name, crash in (("_save_checkpoint", crash_among_ended), ("_add", crash_after_chunk)):
+    for name, crash in (
+        ("_save_checkpoint", crash_among_ended),
+        ("_write_part", crash_after_chunk),
+    ):
         with monkeypatch.context() as patch:
             patch.setattr(SweepFiles, name, crash)
             with pytest.raises(CrashError):
@@ -319,7 +313,6 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
     said = capsys.readouterr().out
     assert said.count("warning: cannot write a checkpoint (No space left on device)") == 2
     assert same(curves(whole), curves(Path("parts")))
-    assert (whole / "results.csv").read_bytes() == Path("parts/results.csv").read_bytes()
     reported, written = [], WrittenReport(1.0, [], 0)
     monkeypatch.setattr(
         sweep_command, "_report", lambda directory: reported.append(directory) or written
@@ -329,7 +322,6 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
     Path("parts/report.html").touch()
     assert run("--resume parts") == 0  # there is nothing left to do
     assert reported == [Path("parts")]
-    assert (whole / "results.csv").read_bytes() == Path("parts/results.csv").read_bytes()
     assert run("--resume parts --learning-rate 0.5") == 2
 
 
@@ -499,7 +491,7 @@ def test_the_policies_of_the_best_and_the_worst_seed_are_kept(run):
     command = f"{SMALL} --num-seeds 5 --chunk-runs 6 --max-updates 6 {RATES} --output swept"
     assert run(command) == 0
     results, env = read_results(Path("swept")), envs.make("Drift-v0")
-    assert not list(Path("swept/parts").glob("policies-*"))
+    assert not Path("swept/parts").exists()
     for number in range(3):
         chosen = results.configuration == number
         final, seeds = results.eval_return[-1, chosen], results.seed[chosen]
