@@ -24,9 +24,6 @@ from mjx_reinforce.training.record import ChunkRecord, RunRecord, Runs
 from mjx_reinforce.training.slots import Compiled, Slots, Stopwatch, compile_slots, started
 from mjx_reinforce.training.state import Budget, begin_with, budget_of, last_actors
 
-#: So many values of a setting are named in a line.
-_NAMED = 6
-
 
 def one_ahead(tasks: Sequence[Callable[[], Any]], clock: Stopwatch) -> Iterator[Any]:
     """Yields the results of tasks in order; each begins when the one before is handed out."""
@@ -158,13 +155,9 @@ class Conductor(Observer[Training]):
         """Returns which configurations the lines that follow are of."""
         every = self._prepared.design.configurations()
         here = [every[number] for number in np.unique(runs.configuration)]
-        said = []
-        for name in here[0]:
-            values = [*dict.fromkeys(say(values[name]) for values in here)]
-            if len(values) > _NAMED:
-                values[_NAMED - 1 : -1] = ["..."]
-            said.append(f"{setting_in_words(name)} {', '.join(values)}")
+        values = {name: [*dict.fromkeys(say(values[name]) for values in here)] for name in here[0]}
         count = f"{counted(len(here), 'configuration')} of {len(every):,}"
+        said = (f"{setting_in_words(name)} {', '.join(x)}" for name, x in values.items())
         return f"{'; '.join(said)} ({count}, {counted(len(runs.seed), 'run')})"
 
     def _progress(self, driver: Training) -> Progress:

@@ -116,23 +116,21 @@ def read_design(directory: Path) -> Design:
 
 def check_design(design: Design) -> None:
     """Raises ValueError for what makes no sense, before anything heavy is imported."""
-    if not design.over:
-        check(design.base)
-        check_installed(design.base)
-        return
     check_each(design.base)
+    if design.over:
+        _check_sweep(design)
+    configure(design.base, design.configurations(), design.given)
+    check_installed(design.base)
+
+
+def _check_sweep(design: Design) -> None:
+    """Raises ValueError for what makes no sense in a sweep."""
     for name in ("minutes", "init_from"):
         if getattr(design.base, name) is not None:
             raise ValueError(f"{flag(name)} is for one run, not for a sweep: leave it out")
     if design.chunk_runs is not None and design.chunk_runs < 1:
         raise ValueError(f"--chunk-runs must be at least 1, got {design.chunk_runs}")
     check_over(design.base, design.over)
-    _check_results(design)
-    configure(design.base, design.configurations(), design.given)
-
-
-def _check_results(design: Design) -> None:
-    """Raises ValueError where memory does not hold what a sweep measures."""
     runs = design.count() * design.base.num_seeds
     if runs * _RESULT > host_memory():
         raise ValueError(
