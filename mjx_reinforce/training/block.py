@@ -47,8 +47,8 @@ def block_of_updates(
     Args:
       build_learner: called while the settings of one run are traced.
       length: rows of the metrics.
-      visit: (key of an evaluation [], whether it is made []) -> its episodes, which are played in
-        one go with those of the first update; None where learners cannot.
+      visit: (key of an evaluation [], active=whether it is made []) -> its episodes, which are
+        played in one go with those of the first update; None where learners cannot.
     """
 
     def active(state: RunState, budget: Budget) -> jax.Array:
@@ -71,7 +71,7 @@ def block_of_updates(
         eval_key: jax.Array,
         look: jax.Array,
     ) -> Any:
-        evaluation = None if visit is None else visit(eval_key, look)
+        evaluation = None if visit is None else visit(eval_key, active=look)
         state, metrics, played = step_with(build_learner(settings), state, going, evaluation)
         looked = {} if evaluation is None or played is None else measure(played, evaluation)
         return state, metrics | {"active": going}, looked

@@ -1,6 +1,7 @@
 """The programs that move runs on side by side; ``slots`` compiles them."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, NamedTuple
 
@@ -11,7 +12,6 @@ import numpy as np
 from mjx_reinforce.engine.base import Environment, plain
 from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.learner import TrainState
-from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.training import state
 from mjx_reinforce.training.block import (
@@ -22,7 +22,7 @@ from mjx_reinforce.training.block import (
 )
 from mjx_reinforce.training.division import ALONE, Division
 from mjx_reinforce.training.state import Budget, RunState, Seed, StateRows
-from mjx_reinforce.training.wrappers import EvaluationEpisodes, SharedLaunch
+from mjx_reinforce.training.wrappers import SharedLaunch
 
 
 class Programs(NamedTuple):
@@ -96,18 +96,13 @@ def programs_of(
         rows = layout.traced_rows(states(seed, numbers, settings))
         return rows, plain(state.last_test_keys(numbers, config))
 
-    def visit(key: jax.Array, active: jax.Array) -> EvaluationEpisodes:
-        return evaluation_episodes(
-            key, num_episodes=config.eval_episodes, active=active, sampled=whole
-        )
-
-    def look(actor: Actor, key: jax.Array, active: jax.Array) -> dict[str, jax.Array]:
-        size = {"num_episodes": config.eval_episodes, "horizon": horizon}
-        return evaluate(env, learner, actor, key, **size, active=active, sampled=whole)
+    size: Any = {"num_episodes": config.eval_episodes, "sampled": whole}
+    visit = functools.partial(evaluation_episodes, **size)
+    play = functools.partial(evaluate, env, learner, horizon=horizon, **size)
 
     def look_at(rows: jax.Array, which: jax.Array) -> dict[str, jax.Array]:
         now = layout.traced_states(rows)
-        return jax.vmap(look)(now.train_states.actor, now.eval_keys, which)
+        return jax.vmap(play)(now.train_states.actor, now.eval_keys, active=which)
 
     updates = block_of_updates(build_learner, config.block_length, visit if rides else None)
 

@@ -91,9 +91,9 @@ def test_schedules_are_told_the_share_of_the_budget(advance):
 
 
 def test_only_the_first_update_looks_and_only_where_asked(advance):
-    def visit(key, look):
+    def visit(key, active):
         del key
-        return look.astype(jnp.int32) + 1
+        return active.astype(jnp.int32) + 1
 
     _, result = advance([1, 1], Budget.of(None, None), look=[True, False], visit=visit)
     assert result.looked["seen"].tolist() == [2, 1]
