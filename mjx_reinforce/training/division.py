@@ -53,13 +53,6 @@ class Division:
         """Returns how many seeds all devices have room for, of so many; some stay empty."""
         return self.seeds * self.width(num_seeds)
 
-    def of_each(self, config: Config, num_seeds: int) -> Config:
-        """Returns the settings of what each device does of so many seeds."""
-        config = dataclasses.replace(config, num_seeds=self.width(num_seeds))
-        if self.episodes == 1:
-            return config
-        return dataclasses.replace(config, num_episodes=config.num_episodes // self.episodes)
-
     def jit(
         self,
         function: Callable[..., Any],
