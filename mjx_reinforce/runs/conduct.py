@@ -5,6 +5,7 @@ import functools
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from typing import Any
 
 import numpy as np
@@ -23,18 +24,6 @@ from mjx_reinforce.training.progress import HOPELESS, Progress
 from mjx_reinforce.training.record import ChunkRecord, RunRecord, Runs
 from mjx_reinforce.training.slots import Compiled, Slots, Stopwatch, compile_slots, started
 from mjx_reinforce.training.state import Budget, begin_with, budget_of, last_actors
-
-
-def one_ahead(tasks: Sequence[Callable[[], Any]], clock: Stopwatch) -> Iterator[Any]:
-    """Yields the results of tasks in order; each begins when the one before is handed out."""
-    if not tasks:
-        return
-    ahead = started(tasks[0])
-    for task in tasks[1:]:
-        result = clock.wait(ahead)
-        ahead = started(task)
-        yield result
-    yield clock.wait(ahead)
 
 
 class Conductor(Observer[Training]):
@@ -67,13 +56,15 @@ class Conductor(Observer[Training]):
         self._done, self._total = 0.0, 0.0
         for part, left in self._stages:
             self._total += _cost(part) * sum(len(runs.seed) for runs in left)
-        tasks = [functools.partial(self._compile, part) for part, _ in self._stages]
-        self._compiled = one_ahead(tasks, self._clock)
-        self._first: Compiled | None = None
+        #: The programs of the group that is next.
+        self._next: Future[Compiled] = Future()
 
     def compile_first(self) -> None:
-        """Waits for the programs of the first group, if any runs are left."""
-        self._first = next(self._compiled, None)
+        """Compiles the programs of the first group, if any runs are left, as the caller would."""
+        if self._stages:
+            began = time.perf_counter()
+            self._next.set_result(self._compile(self._stages[0][0]))
+            self._clock.compiling += time.perf_counter() - began
 
     def conduct(self, interrupted: Callable[[], bool]) -> tuple[Training | None, dict[str, Any]]:
         """Trains all groups, to their end or until they are interrupted.
@@ -130,8 +121,10 @@ class Conductor(Observer[Training]):
 
     def _chunks(self) -> Iterator[tuple[Part, Runs, Compiled]]:
         """Yields the chunks that are left, with the programs of their group."""
-        for part, left in self._stages:
-            compiled, self._first = self._first or next(self._compiled), None
+        for number, (part, left) in enumerate(self._stages, start=1):
+            compiled = self._clock.wait(self._next)
+            for following, _ in self._stages[number : number + 1]:
+                self._next = started(functools.partial(self._compile, following))
             for runs in left:
                 yield part, runs, compiled
 

@@ -173,7 +173,7 @@ class Slots:
 
     def restore(self, states: RunState | np.ndarray) -> None:
         """Takes other states of these runs, or rows of them."""
-        rows = states if isinstance(states, np.ndarray) else self.layout.rows(states)
+        rows = states.copy() if isinstance(states, np.ndarray) else self.layout.rows(states)
         self._rows, self._placed = rows, None
 
     def advance(
