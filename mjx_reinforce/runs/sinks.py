@@ -16,7 +16,7 @@ import struct
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -27,23 +27,6 @@ from mjx_reinforce.training.record import Cells
 
 #: The package that each needs.
 _NEEDED = {"tensorboard": "tensorboardX", "wandb": "wandb"}
-
-
-class Sink(Protocol):
-    """Takes the rows of evaluations, in order; metrics.csv has those that could not be written.
-
-    name: for people
-    """
-
-    name: str
-
-    def write(self, rows: Cells) -> None:
-        """Adds the rows of one evaluation, or raises OSError."""
-        ...
-
-    def close(self) -> None:
-        """Ends it after the last rows; raises OSError if that fails."""
-        ...
 
 
 def check_installed(config: Config) -> None:
@@ -57,25 +40,6 @@ def check_installed(config: Config) -> None:
                 f"--log {name} needs the package {package}, which is not installed; "
                 f"pip install {package}, or leave {name} out"
             )
-
-
-def open_sinks(config: Config, directory: Path, updates: int | None) -> list[Sink]:
-    """Opens the sinks that the settings ask for, each where it is to go on.
-
-    Args:
-      config: the settings.
-      directory: of the run; its metrics.csv has the rows from before.
-      updates: after how many a resumed run goes on; None at the first evaluation.
-
-    Raises:
-      OSError: one of them cannot be written.
-    """
-    sinks: list[Sink] = []
-    if "tensorboard" in config.log:
-        sinks.append(TensorBoard(directory, updates))
-    if "wandb" in config.log:
-        sinks.append(WeightsAndBiases(directory))
-    return sinks
 
 
 #: Seeds that are shown one by one, the first ones: each is a curve for every column.
@@ -186,8 +150,9 @@ class WeightsAndBiases:
 
     name = "to W&B"
 
-    def __init__(self, directory: Path):
+    def __init__(self, directory: Path, updates: int | None):
         """Begins the run in a directory of ours, or goes on with it; raises OSError."""
+        del updates  # W&B itself drops what it has
         import wandb
 
         path, mode = directory / WANDB_RUN, os.environ.get("WANDB_MODE", "offline")
@@ -227,3 +192,22 @@ def _errors_as_os_errors() -> Iterator[None]:
     except wandb.Error as error:
         remedy = "run wandb login, or unset WANDB_MODE and send the run later by wandb sync"
         raise OSError(f"{str(error).rstrip('.')}; {remedy}") from error
+
+
+#: Takes the rows of evaluations, in order; metrics.csv has those that could not be written.
+Sink = TensorBoard | WeightsAndBiases
+_SINKS: dict[str, type[Sink]] = {"tensorboard": TensorBoard, "wandb": WeightsAndBiases}
+
+
+def open_sinks(config: Config, directory: Path, updates: int | None) -> list[Sink]:
+    """Opens the sinks that the settings ask for, each where it is to go on.
+
+    Args:
+      config: the settings.
+      directory: of the run; its metrics.csv has the rows from before.
+      updates: after how many a resumed run goes on; None at the first evaluation.
+
+    Raises:
+      OSError: one of them cannot be written.
+    """
+    return [_SINKS[name](directory, updates) for name in config.log]

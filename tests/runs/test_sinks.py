@@ -212,7 +212,7 @@ def test_wandb_is_offline_and_goes_on(directory, wandb):
     """Both parts are of one run."""
     _, begun, logged = wandb
     for updates in ((0, 5), (5, 10)):
-        sink = sinks.WeightsAndBiases(directory)
+        sink = sinks.WeightsAndBiases(directory, None)
         for update in updates:
             sink.write(evaluation(update))
         sink.close()
