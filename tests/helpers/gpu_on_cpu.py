@@ -133,20 +133,17 @@ def emulate(monkeypatch, threads=1, block=None):
         code = compiled(text, block)
         return ptx.Kernel(code.key, str(code.addresses[ENTRY]), 256, 1, 0, compiled=True)
 
-    def call(kernel, grid, given, written, scratch=()):
-        results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in written]
+    def call(kernel, grid, given, results):
         size = 32 * -(-threads // 32)
 
-        def run(*args):
-            args = [np.array(x, order="C") for x in args]
-            left = args[len(given) :]
-            assert not any(x.any() for x in left)
+        def run(*given):
+            given = [np.array(x, order="C") for x in given]
+            made = [np.zeros(x.shape, x.dtype) for x in results]
+            scratch = [np.full(kernel.scratch * size, np.nan, np.float32)] * bool(kernel.scratch)
+            run_threads(int(kernel.text), threads, [*given, *made, *made, *scratch])
+            return made
 
-            nans = [np.full(x.size // grid[1] * size, np.nan, np.float32) for x in scratch]
-            run_threads(int(kernel.text), threads, [*args, *left, *nans])
-            return left
-
-        return jax.pure_callback(run, results, *given, *written)
+        return jax.pure_callback(run, results, *given)
 
     monkeypatch.setattr(available, "platform", lambda: "gpu")
     monkeypatch.setattr(seam, "kernels_unavailable", lambda: None)

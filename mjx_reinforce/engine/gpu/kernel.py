@@ -165,8 +165,8 @@ class _Kernel:
         text = self.text
         place = self._wide(item)
         for leaf, given in zip((x for x in self.state if x.size), self.given["state"], strict=True):
-            self._copy(given, place, leaf, leaf.size)
-        self._copy("%keys", place, self.keys, 2)
+            _copy(text, given, place, leaf, leaf.size)
+        _copy(text, "%keys", place, self.keys, 2)
         for value, where in (
             (mode, self.mode.pointer),
             ("0", self.at.pointer),
@@ -175,15 +175,6 @@ class _Kernel:
             (running, self.running),
         ):
             text.store(value, where, _INT)
-
-    def _copy(self, source: str, row: str, leaf: _Leaf, count: int) -> None:
-        """Writes the copy of a row [count] of an array into a leaf of the thread's own."""
-        text = self.text
-        before = text.let(f"mul i64 {row}, {count}")
-        start = text.at(source, leaf.dtype, before)
-        for k in range(count):
-            value = text.load(text.at(start, leaf.dtype, k), leaf.dtype)
-            text.store(value, text.at(leaf.pointer, leaf.dtype, k), leaf.dtype)
 
     def _play(self, running: str) -> None:
         """Writes a step of the thread's episode, which counts if it is running, and its end."""
@@ -254,6 +245,14 @@ class _Kernel:
         return self.text.let(f"zext i32 {number} to i64")
 
 
+def _copy(text: Text, source: str, row: str, leaf: _Leaf, count: int) -> None:
+    """Writes the copy of a row [count] of an array into a leaf of the thread's own."""
+    start = text.at(source, leaf.dtype, text.let(f"mul i64 {row}, {count}"))
+    for k in range(count):
+        value = text.load(text.at(start, leaf.dtype, k), leaf.dtype)
+        text.store(value, text.at(leaf.pointer, leaf.dtype, k), leaf.dtype)
+
+
 def mapping_text(written: scalarized.Scalarized) -> str:
     """Returns the LLVM IR of ``@play``, without a target.
 
@@ -266,12 +265,10 @@ def mapping_text(written: scalarized.Scalarized) -> str:
       written: the function.
     """
     text = Text(1)
-    given = [k for k, leaf in enumerate(written.in_avals) if num_entries(leaf)]
+    sizes = [(np.dtype(x.dtype), num_entries(x)) for x in written.in_avals]
+    own = [_Leaf(text.reserve(*leaf) if leaf[1] else "null", *leaf) for leaf in sizes]
+    given = [k for k, leaf in enumerate(own) if leaf.size]
     made = [k for k, leaf in enumerate(written.out_avals) if num_entries(leaf)]
-    own = [
-        text.reserve(x.dtype, num_entries(x)) if num_entries(x) else "null"
-        for x in written.in_avals
-    ]
     asked = [f"i32 @llvm.nvvm.read.ptx.sreg.{x}.x()" for x in ("tid", "ctaid", "ntid")]
     text.declared |= {f"declare {x}" for x in asked}
     in_block, block, threads = (text.let(f"call {x}") for x in asked)
@@ -287,12 +284,8 @@ def mapping_text(written: scalarized.Scalarized) -> str:
     row = text.let(f"select i1 {running}, i32 {item.name}, i32 0")  # waits with another's numbers
     row = text.let(f"zext i32 {row} to i64")
     for k in given:
-        leaf = written.in_avals[k]
-        start = text.at(f"%given{k}", leaf.dtype, text.let(f"mul i64 {row}, {num_entries(leaf)}"))
-        for entry in range(num_entries(leaf)):
-            value = text.load(text.at(start, leaf.dtype, entry), leaf.dtype)
-            text.store(value, text.at(own[k], leaf.dtype, entry), leaf.dtype)
-    emit = Lockstep(text, lambda k: Input(own[k], np.dtype(written.in_avals[k].dtype)))
+        _copy(text, f"%given{k}", row, own[k], own[k].size)
+    emit = Lockstep(text, lambda k: Input(own[k].pointer, own[k].dtype))
     results = emit.compile(written.schedule, written.outputs)
     with text.when(running):
         for k in made:

@@ -166,7 +166,7 @@ def _launch(
     counts = [shape(x, jnp.int32) for x in ((seeds, episodes), (seeds, episodes), (seeds,), (1,))]
     kernel, grid = _sized(kernel, seeds * episodes)
     sizes = jnp.array([seeds, episodes, horizon], jnp.int32)
-    return _fill(kernel, grid, [sizes, *args], [*records, *counts])[:-1]
+    return _call(kernel, grid, [sizes, *args], [*records, *counts])[:-1]
 
 
 def launch_map(
@@ -185,42 +185,29 @@ def launch_map(
         sized, grid = _sized(kernel, examples)
         sizes = jnp.array([examples, math.prod(grid)], jnp.int32)
         made = [jax.ShapeDtypeStruct((examples, *x.shape[1:]), x.dtype) for x in results]
-        return _fill(sized, grid, [sizes, *args], made)
+        return _call(sized, grid, [sizes, *args], made)
 
     return in_one_launch(play)(*args)
-
-
-def _fill(
-    kernel: ptx.Kernel,
-    grid: tuple[int, int],
-    given: Sequence[jax.Array],
-    results: Sequence[jax.ShapeDtypeStruct],
-) -> Sequence[jax.Array]:
-    """Returns what a kernel writes into zeros of these shapes."""
-    words = kernel.scratch * math.prod(grid)
-    scratch = [jax.ShapeDtypeStruct((words,), jnp.int32)] if words else []
-    zeros = [jnp.zeros(x.shape, x.dtype) for x in results]
-    return _call(kernel, grid, given, zeros, scratch)[: len(results)]
 
 
 def _call(
     kernel: ptx.Kernel,
     grid: tuple[int, int],
     given: Sequence[jax.Array],
-    written: Sequence[jax.Array],
-    scratch: Sequence[jax.ShapeDtypeStruct] = (),
+    results: Sequence[jax.ShapeDtypeStruct],
 ) -> Sequence[jax.Array]:
-    """Launches so many blocks of so many threads.
+    """Launches so many blocks of so many threads; returns what they make of zeros of these shapes.
 
-    They also write into ``scratch``, a buffer that begins with any values. Returns ``written`` as
-    they leave it, and then that buffer.
+    They also write into a buffer that begins with any values, if the kernel has scratch.
     """
-    results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in written]
+    words = kernel.scratch * math.prod(grid)
+    scratch = [jax.ShapeDtypeStruct((words,), jnp.int32)] if words else []
+    zeros = [jnp.zeros(x.shape, x.dtype) for x in results]
     aliases = {len(given) + k: k for k in range(len(results))}
     blocks, threads = map(np.int32, grid)
     target = _handler(kernel)
     call = jax.ffi.ffi_call(target, [*results, *scratch], input_output_aliases=aliases)
-    return call(*given, *written, blocks=blocks, threads=threads)
+    return call(*given, *zeros, blocks=blocks, threads=threads)[: len(results)]
 
 
 def _sized(kernel: ptx.Kernel, items: int) -> tuple[ptx.Kernel, tuple[int, int]]:

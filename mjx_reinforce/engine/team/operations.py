@@ -9,7 +9,7 @@ from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive
 from mjx_reinforce.engine.scalar.nodes import FACTS, Op
 
 #: The C++ type of each dtype.
-TYPES = {
+_TYPES = {
     "bool": "bool",
     "int8": "signed char",
     "uint8": "unsigned char",
@@ -20,20 +20,8 @@ TYPES = {
     "float32": "float",
     "float64": "double",
 }
-_INFIX = {
-    "add": "+",
-    "sub": "-",
-    "mul": "*",
-    "and": "&",
-    "or": "|",
-    "xor": "^",
-    "eq": "==",
-    "ne": "!=",
-    "lt": "<",
-    "le": "<=",
-    "gt": ">",
-    "ge": ">=",
-}
+_NAMES, _SIGNS = "add sub mul and or xor eq ne lt le gt ge", "+ - * & | ^ == != < <= > >="
+_INFIX = dict(zip(_NAMES.split(), _SIGNS.split(), strict=True))
 #: Functions of floats that the C library and CUDA have under these names, with an f for float32.
 _LIBRARY = {
     **dict.fromkeys(("floor", "ceil", "sqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p")),
@@ -60,9 +48,9 @@ _OURS = {
 
 def type_of(dtype: np.dtype) -> str:
     """Returns the C++ type of a dtype."""
-    if np.dtype(dtype).name not in TYPES:
+    if (name := np.dtype(dtype).name) not in _TYPES:
         raise UnsupportedPrimitive(f"it has numbers of {dtype}")
-    return TYPES[np.dtype(dtype).name]
+    return _TYPES[name]
 
 
 def literal(number: np.generic) -> str:
@@ -76,9 +64,8 @@ def literal(number: np.generic) -> str:
     if not np.isfinite(number):
         word = "unsigned" if name == "float" else "unsigned long long"
         return f"bits<{name}>(({word})({int(number.view(f'u{number.dtype.itemsize}'))}ull))"
-    return (
-        f"{float(number).hex() if number else repr(float(number))}{'f' if name == 'float' else ''}"
-    )
+    exact = float(number).hex() if number else repr(float(number))
+    return exact + ("f" if name == "float" else "")
 
 
 def expression(op: Op, dtype: np.dtype, kinds: list[np.dtype], args: list[str]) -> str:
@@ -91,6 +78,7 @@ def expression(op: Op, dtype: np.dtype, kinds: list[np.dtype], args: list[str]) 
       args: its operands.
     """
     name, kind, of = op.name, np.dtype(dtype).kind, np.dtype(kinds[-1])
+    suffix = "f" if of == np.float32 else ""
     if name in _INFIX:
         return f"{args[0]} {_INFIX[name]} {args[1]}"
     if name == "select_n":
@@ -105,9 +93,8 @@ def expression(op: Op, dtype: np.dtype, kinds: list[np.dtype], args: list[str]) 
         return f"-{args[0]}"
     if name == "round" and of.kind == "f":
         to_even = int(dict(op.params)["rounding_method"]) == 1  # type: ignore[call-overload]
-        return f"{'rint' if to_even else 'round'}{'f' if of.itemsize == 4 else ''}({args[0]})"
+        return f"{'rint' if to_even else 'round'}{suffix}({args[0]})"
     if name in _LIBRARY and of.kind == "f":
-        suffix = "f" if of.itemsize == 4 else ""
         return f"{_LIBRARY[name] or name}{suffix}({', '.join(args)})"
     if name == "abs":
         return f"{args[0]} < 0 ? -{args[0]} : {args[0]}"

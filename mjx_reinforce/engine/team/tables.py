@@ -5,8 +5,7 @@ the joint's anchor. A body without a joint belongs to the link that carries it: 
 anchors have fixed places in the frames of links.
 """
 
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -222,7 +221,7 @@ class _Tables:
         """Makes them; see ``physics_text``."""
         self.m = m
         self.constants: dict[str, int] = {}
-        self.functions: dict[str, Sequence[int]] = {}
+        self.functions: dict[str, Iterable[int]] = {}
         self.ints: dict[str, Any] = {}
         self.masks: dict[str, Any] = {}
         self.reals: dict[str, Any] = {}
@@ -279,8 +278,7 @@ class _Tables:
         origin = np.eye(4)[0]
         self.frames, self.parents = [_Frame(-1, np.zeros(3), origin)], []
         names = ("link_at", "link_quat", "link_turned", "link_zero")
-        rows: dict[str, list] = {name: [] for name in names}
-        kinds = []
+        rows = []
         for body in range(1, m.nbody):
             frame = self.frames[m.body_parentid[body]].then(m.body_pos[body], m.body_quat[body])
             for joint in range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body]):
@@ -292,22 +290,17 @@ class _Tables:
                     turned = [*(_rotation(frame.quat) @ axis), 0]
                 one = kind in (_HINGE, _SLIDE)
                 zero = m.qpos0[m.jnt_qposadr[joint]] if one else 0
-                for name, x in zip(
-                    names, (frame.place(anchor), frame.quat, turned, zero), strict=True
-                ):
-                    rows[name].append(x)
+                rows.append((frame.place(anchor), frame.quat, turned, zero))
                 self.parents.append(-1 if is_free else frame.link)
-                kinds.append(int(kind))
                 frame = _Frame(joint, -np.asarray(anchor), origin)
             self.frames.append(frame)
-        self.kinds = np.array(kinds)
-        self.reals |= rows
-        self.ints |= {"link_kind": kinds, "link_qpos": m.jnt_qposadr, "link_dof": m.jnt_dofadr}
+        self.kinds = m.jnt_type
+        self.reals |= zip(names, zip(*rows, strict=True), strict=True)
+        self.ints |= {"link_kind": self.kinds, "link_qpos": m.jnt_qposadr, "link_dof": m.jnt_dofadr}
         self.functions["link_parent"] = self.parents
         self.functions["has_children"] = [int(x in self.parents) for x in range(m.njnt)]
         rotating = np.flatnonzero(self.kinds <= _BALL)
-        shift = [3 if self.kinds[x] == _FREE else 0 for x in rotating]
-        self.ints["turn_dof"] = m.jnt_dofadr[rotating] + np.array(shift, int)
+        self.ints["turn_dof"] = m.jnt_dofadr[rotating] + 3 * (self.kinds[rotating] == _FREE)
         self.constants["NTURN"] = len(rotating)
 
     def _bodies(self) -> None:
@@ -354,8 +347,7 @@ class _Tables:
         self.reals["dof_stiffness"] = np.where(one, m.jnt_stiffness[joint], 0)
         self.reals |= {"dof_spring": m.qpos_spring[qpos], "dof_zero": m.qpos0[qpos]}
         self.functions["dof_parent"] = m.dof_parentid
-        last = [int(i == m.nv - 1 or joint[i + 1] != joint[i]) for i in range(m.nv)]
-        self.functions["last_of_link"] = [joint[i] if x else -1 for i, x in enumerate(last)]
+        self.functions["last_of_link"] = np.where(np.diff(joint, append=-1), joint, -1)
         moved = [[] for _ in range(m.njnt + 1)]
         paired = []
         for i in range(m.nv):
@@ -415,34 +407,26 @@ class _Tables:
         """Makes the tables of actuators, in the order of the degrees of freedom that they move."""
         m = self.m
         dofs = m.jnt_dofadr[m.actuator_trnid[:, 0]] if m.nu else np.zeros(0, int)
-        order, rows = np.argsort(dofs, kind="stable"), []
-        for a in order:
-            bounds = (
-                m.actuator_ctrlrange[a] if m.actuator_ctrllimited[a] else (-_NO_LIMIT, _NO_LIMIT)
-            )
-            forces = (-_NO_LIMIT, _NO_LIMIT)
-            if m.actuator_forcelimited[a]:
-                forces = m.actuator_forcerange[a]
-            gain, bias = np.array(m.actuator_gainprm[a][:3]), np.array(m.actuator_biasprm[a][:3])
-            if m.actuator_gaintype[a] == _C.mjtGain.mjGAIN_FIXED:
-                gain[1:] = 0
-            if m.actuator_biastype[a] == _C.mjtBias.mjBIAS_NONE:
-                bias[:] = 0
-            rows.append([m.actuator_gear[a, 0], *bounds, gain[0], *bias, *forces, *gain[1:]])
-        self.reals["actuator"] = rows
+        order, free = np.argsort(dofs, kind="stable"), (-_NO_LIMIT, _NO_LIMIT)
+        bounds = np.where(m.actuator_ctrllimited[:, None], m.actuator_ctrlrange, free)
+        forces = np.where(m.actuator_forcelimited[:, None], m.actuator_forcerange, free)
+        gain, bias = m.actuator_gainprm[:, :3].copy(), m.actuator_biasprm[:, :3].copy()
+        gain[m.actuator_gaintype == _C.mjtGain.mjGAIN_FIXED, 1:] = 0
+        bias[m.actuator_biastype == _C.mjtBias.mjBIAS_NONE] = 0
+        rows = np.hstack([m.actuator_gear[:, :1], bounds, gain[:, :1], bias, forces, gain[:, 1:]])
+        self.reals["actuator"] = rows[order]
         self.ints["actuator_ctrl"] = m.actuator_ctrladr[order] if m.nu else []
         self.ints["dof_actuator"] = np.searchsorted(dofs[order], np.arange(m.nv + 1))
         joint = self.dof_joint
-        ends = np.tile([-_NO_LIMIT, _NO_LIMIT], (m.nv, 1))
-        limited = np.asarray(m.jnt_actfrclimited, bool)[joint]
-        self.reals["dof_force"] = np.where(limited[:, None], m.jnt_actfrcrange[joint], ends)
+        limited = m.jnt_actfrclimited[joint, None]
+        self.reals["dof_force"] = np.where(limited, m.jnt_actfrcrange[joint], free)
 
     def _equalities(self) -> None:
         """Makes the tables of equality constraints."""
         m = self.m
-        active = [e for e in range(m.neq) if m.eq_active0[e]]
-        connects = [e for e in active if m.eq_type[e] == _EQUALITY.mjEQ_CONNECT]
-        joined = [e for e in active if m.eq_type[e] == _EQUALITY.mjEQ_JOINT]
+        kinds = np.where(m.eq_active0, m.eq_type, -1)
+        connects = np.flatnonzero(kinds == _EQUALITY.mjEQ_CONNECT)
+        joined = np.flatnonzero(kinds == _EQUALITY.mjEQ_JOINT)
         self.constants |= {"NCONNECT": len(connects), "NE": 3 * len(connects) + len(joined)}
         links, places, bodies = [], [], []
         for e in connects:
@@ -457,13 +441,11 @@ class _Tables:
         self.ints |= {"connect_link": links, "connect_body": bodies}
         self.reals |= {"connect_at": places, "connect_weight": weights}
         self.ints["connect_soft"] = [self._soft(m.eq_solref[e], m.eq_solimp[e]) for e in connects]
-        dofs = []
-        for e in joined:
-            second = m.eq_obj2id[e]
-            dofs.append([m.jnt_dofadr[m.eq_obj1id[e]], m.jnt_dofadr[second] if second >= 0 else -1])
+        joints = np.stack([m.eq_obj1id[joined], m.eq_obj2id[joined]], 1)
+        dofs = np.where(joints >= 0, m.jnt_dofadr[joints], -1)
         self.ints["joined_dof"] = dofs
         self.ints["joined_soft"] = [self._soft(m.eq_solref[e], m.eq_solimp[e]) for e in joined]
-        self.reals["joined_poly"] = [m.eq_data[e, :5] for e in joined]
+        self.reals["joined_poly"] = m.eq_data[joined, :5]
         self.reals["joined_weight"] = [sum(m.dof_invweight0[x] for x in d if x >= 0) for d in dofs]
 
     def _jumps(self) -> None:
@@ -514,28 +496,25 @@ class _Tables:
         self.reals |= {"kind_margin": [x[1] for x in rows], "kind_friction": [x[2:7] for x in rows]}
         self.constants |= {"NI": len(items), "NEAR": max(1, min(near, len(items)))}
         self.constants |= {"CD": max(x[0] for x in rows), "NG": max(len(used), 1)}
-        self._geoms(used)
+        self._geoms(np.array(used, int))
 
-    def _geoms(self, used: Sequence[int]) -> None:
+    def _geoms(self, used: np.ndarray) -> None:
         """Makes the tables of the geoms that may meet."""
-        m, kinds, radii, halves, reach = self.m, [], [], [], []
+        m = self.m
         frames = [self.frames[m.geom_bodyid[g]].then(m.geom_pos[g], m.geom_quat[g]) for g in used]
-        for g in used:
-            kind, size = m.geom_type[g], m.geom_size[g]
-            plane, capsule, box = kind == _PLANE, kind == _CAPSULE, kind == _BOX
-            kinds.append(0 if plane else 2 if box else 1)
-            radii.append(0 if plane or box else size[0])
-            halves.append(size[1] if capsule else 0)
-            reach.append(math.sqrt(size @ size) if box else radii[-1] + halves[-1])
+        types, size = m.geom_type[used], m.geom_size[used]
+        plane, box = types == _PLANE, types == _BOX
+        radii = np.where(plane | box, 0, size[:, 0])
+        halves = np.where(types == _CAPSULE, size[:, 1], 0)
+        reach = np.where(box, np.linalg.norm(size, axis=1), radii + halves)
         turns = [_rotation(x.quat) for x in frames]
-        self.ints |= {"geom_kind": kinds, "geom_body": [m.geom_bodyid[g] for g in used]}
+        self.ints |= {"geom_kind": np.where(box, 2, ~plane), "geom_body": m.geom_bodyid[used]}
         self.ints["geom_link"] = [self._world(x.link) for x in frames]
         self.reals |= {"geom_at": [x.at for x in frames], "geom_axis": [x[:, 2] for x in turns]}
         self.reals |= {"geom_radius": radii, "geom_half": halves, "geom_reach": reach}
-        boxes = int(2 in kinds)
-        self.constants["HAS_BOX"] = boxes
-        self.reals["geom_turn"] = turns if boxes else []
-        self.reals["geom_size"] = [m.geom_size[g] for g in used] if boxes else []
+        self.constants["HAS_BOX"] = box.any()
+        self.reals |= {"geom_turn": turns if box.any() else []}
+        self.reals |= {"geom_size": size if box.any() else []}
 
     def _pair_of_geoms(self, g: int, h: int) -> tuple[int, float, np.ndarray, int]:
         """Returns condim, margin, friction [5] and softness of contacts, as C mixes them."""

@@ -6,6 +6,7 @@ computed by the lanes together, where they are the same formula of other numbers
 """
 
 import contextlib
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -126,8 +127,8 @@ class CText(Backend[str]):
     def fill(self, array: str, scalars: Sequence[Scalar]) -> None:
         """Writes scalars of the program into an array."""
         self._prepare(scalars)
-        start = 0
-        for run in self._runs(scalars):
+        start, runs = 0, [list(run) for _, run in itertools.groupby(scalars, self._form)]
+        for run in runs:
             if len(run) < _FEWEST:
                 for k, x in enumerate(run, start=start):
                     self.line(f"if (t.lane == 0) {array}[{k}] = {self.value(x, self._values)};")
@@ -193,14 +194,13 @@ class CText(Backend[str]):
         self, loop: LiveLoop, values: dict[Node, str]
     ) -> tuple[Sequence[str], Sequence[Sequence[str]]]:
         """Writes a loop."""
-        known, names, kept, rows = {}, [], [], []
+        known, names, kept = {}, [], []
         for carry in loop.carries:
             names.append(self.name())
             init = self.value(carry.init, values)
             self.line(f"{type_of(carry.leaf.dtype)} {names[-1]} = {init};")
             known[carry.leaf] = names[-1]
-        for element in loop.elements:
-            rows.append(self._row(element.values, values))
+        rows = [self._row(element.values, values) for element in loop.elements]
         for record in loop.records:
             kept.append(self.name())
             self.line(f"{type_of(record.value.dtype)} {kept[-1]}[{loop.length}];")
@@ -309,8 +309,7 @@ class CText(Backend[str]):
         made = self._arrays[call, 0] = self._reserve(units[0].dtype, len(units))
         is_tanh = str(call.name == "tanh_layer").lower()
         sizes = f"{len(call.args[0])}, {len(units)}"
-        self.line(f"layer<{is_tanh}>(t, {x}, {kernel}, {bias}, {sizes}, {made});")
-        self.line("t.sync();")
+        self.lines += [f"layer<{is_tanh}>(t, {x}, {kernel}, {bias}, {sizes}, {made});", "t.sync();"]
 
     def _simulate(self, call: Call) -> None:
         names = [field.rpartition(".")[2] for field in call.fields]
@@ -326,9 +325,7 @@ class CText(Backend[str]):
                 self.fill(_FIELDS[field], scalars)
         if self._simulates_once:
             self._read_from(_FIELDS["ctrl"], call.args[0])  # which the physics leaves as it is
-        self.line("t.sync();")
-        self.line(_SIMULATES[call.name].format(sound, self._skip))
-        self.line("t.sync();")
+        self.lines += ["t.sync();", _SIMULATES[call.name].format(sound, self._skip), "t.sync();"]
         if not self._simulates_once:  # another operation may overwrite it
             for number, (name, out) in enumerate(zip(names, call.outs, strict=True)):
                 if out:
@@ -390,13 +387,6 @@ class CText(Backend[str]):
         parts = [kind.meet.format(name), *(self.value(x, values) for x in alone)]
         self.line(f"const {type_of(dtype)} {total} = {f' {kind.sign} '.join(parts)};")
         return total
-
-    def _runs(self, scalars: Sequence[Scalar]) -> Iterator[Sequence[Scalar]]:
-        """Yields neighbors of one formula."""
-        forms = [self._form(x) for x in scalars]
-        starts = [k for k, x in enumerate(forms) if k == 0 or x != forms[k - 1]]
-        for start, end in zip(starts, [*starts[1:], len(forms)], strict=True):
-            yield scalars[start:end]
 
     def _each(self, run: Sequence[Scalar], use: str) -> None:
         """Writes a loop in which the lanes share scalars of one formula.
