@@ -22,7 +22,8 @@ from mjx_reinforce.registry import (
     find_algorithm,
     is_own,
 )
-from mjx_reinforce.settings.declare import MAX_COUNT, MAX_OF_UPDATE, Range
+from mjx_reinforce.settings.declare import MAX_COUNT as MAX_COUNT
+from mjx_reinforce.settings.declare import MAX_OF_UPDATE, Range
 from mjx_reinforce.settings.groups import (
     CheckpointSettings,
     EstimatorSettings,
@@ -174,36 +175,6 @@ def flag(name: str) -> str:
 def spoken(name: str) -> str:
     """Returns the name of a setting as people write it, such as learning-rate."""
     return name.replace("_", "-")
-
-
-def check_step_count(config: Config, horizon: int) -> None:
-    """Raises ValueError if a seed may play more env steps than are counted.
-
-    A seed stops after the update that reaches its budget, so it may pass ``env_steps`` by
-    one update of full episodes.
-
-    Args:
-      config: the settings; at least one of the two budgets is given.
-      horizon: the time limit of an episode in steps.
-    """
-    horizon = config.training_horizon(horizon)
-    an_update = config.episodes_per_update * horizon
-    bounds = []
-    if config.env_steps is not None:
-        bounds.append(config.env_steps - 1 + an_update)
-    if config.max_updates is not None:
-        bounds.append(config.max_updates * an_update)
-    each = f"{config.episodes_per_update:,} episodes an update, up to {horizon:,} steps each"
-    if an_update > MAX_OF_UPDATE:
-        raise ValueError(
-            f"an update may play {an_update:,} env steps of a seed ({each}), more than the "
-            "2^31 - 1 that can be counted; lower --num-episodes or --train-horizon"
-        )
-    if min(bounds) > MAX_COUNT:
-        raise ValueError(
-            f"a seed may play {min(bounds):,} env steps ({each}), more than the 2^53 that can be "
-            "counted; give --env-steps, or lower --max-updates or --train-horizon"
-        )
 
 
 def _check_reinforce(config: Config) -> None:

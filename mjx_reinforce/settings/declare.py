@@ -16,14 +16,6 @@ Value = TypeVar("Value")
 MAX_COUNT = 2**53
 #: The greatest of what an update counts, such as its env steps: they are int32.
 MAX_OF_UPDATE = 2**31 - 1
-#: The greatest learning rate.
-_MAX_RATE = 1000
-#: The greatest of other numbers, and one over the least: float32 holds their cubes.
-_MAX_SIZE = 1e12
-#: The most steps that an update may make one after the other, besides those of the episodes.
-_MAX_STEPS = 1_000_000
-#: The greatest number of layers: each is a matrix of its own in the program.
-_MAX_LAYERS = 100
 
 
 class Range(enum.Enum):
@@ -40,37 +32,17 @@ class Range(enum.Enum):
     AT_LEAST_0 = "at least 0", lambda x: x >= 0
     COUNTED = "at most 2^53, for no more is counted exactly", lambda x: x <= MAX_COUNT
     INT32 = "less than 2^31", lambda x: x <= MAX_OF_UPDATE
-    IN_A_ROW = (
-        f"at most {_MAX_STEPS:,}, for an update makes so many steps one after the other",
-        lambda x: x <= _MAX_STEPS,
-    )
     SEED = "in [0, 2^32)", lambda x: 0 <= x < 2**32
     SHARE = "in [0, 1]", lambda x: 0 <= x <= 1
     BELOW_1 = "in [0, 1 - 2^-24], the last float32 below 1", lambda x: 0 <= x <= 1 - 2**-24
     LAYERS = "positive in every layer", lambda x: all(n >= 1 for n in x)
-    LAYERS_INT32 = "less than 2^31 in every layer", lambda x: all(n <= MAX_OF_UPDATE for n in x)
-    FEW_LAYERS = f"at most {_MAX_LAYERS} layers", lambda x: len(x) <= _MAX_LAYERS
     POSITIVE = "positive and finite", lambda x: math.isfinite(x) and x > 0
     NOT_NEGATIVE = "finite and not negative", lambda x: math.isfinite(x) and x >= 0
-    # Weights are about 1, and most optimisers move each of them by about the rate.
-    RATE = (
-        f"in [{1 / _MAX_SIZE:g}, {_MAX_RATE}], for a step moves a weight by about that",
-        lambda x: 1 / _MAX_SIZE <= x <= _MAX_RATE,
-    )
-    FLOAT32 = (
-        f"in [{1 / _MAX_SIZE:g}, {_MAX_SIZE:g}], for runs compute in float32",
-        lambda x: x == 0 or 1 / _MAX_SIZE <= x <= _MAX_SIZE,
-    )
 
 
 #: What holds of numbers of a kind.
 COUNT = (Range.AT_LEAST_1, Range.INT32)
 TOTAL = (Range.AT_LEAST_1, Range.COUNTED)
-STEPS = (Range.AT_LEAST_1, Range.IN_A_ROW)
-LAYERS = (Range.LAYERS, Range.LAYERS_INT32, Range.FEW_LAYERS)
-POSITIVE = (Range.POSITIVE, Range.FLOAT32)
-NOT_NEGATIVE = (Range.NOT_NEGATIVE, Range.FLOAT32)
-RATE = (Range.POSITIVE, Range.RATE)
 
 
 class Mark(enum.Enum):

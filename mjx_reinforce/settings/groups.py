@@ -7,19 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mjx_reinforce.registry import find_algorithm, is_own
-from mjx_reinforce.settings.declare import (
-    COUNT,
-    LAYERS,
-    NOT_NEGATIVE,
-    POSITIVE,
-    RATE,
-    STEPS,
-    TOTAL,
-    Mark,
-    Range,
-    Value,
-    setting,
-)
+from mjx_reinforce.settings.declare import COUNT, TOTAL, Mark, Range, Value, setting
 
 #: Families whose standard deviation is a parameter, the same in all states.
 _FREE_STD = ("normal", "truncated-normal", "clipped-normal", "tanh-normal")
@@ -152,20 +140,20 @@ class PolicySettings:
     the state), truncated-normal, clipped-normal, tanh-normal (on the action bounds), categorical
     (discrete actions), deterministic (ars only); auto is categorical where the actions are
     discrete, else normal, or deterministic for ars. Or module:name."""
-    hidden_sizes: tuple[int, ...] = setting((32, 32), *LAYERS)
+    hidden_sizes: tuple[int, ...] = setting((32, 32), Range.LAYERS)
     """Units of each tanh layer of the policy network. The flag without a number makes the policy
     linear."""
-    initial_std: float = setting(0.5, *POSITIVE, Reader.STD, Mark.TRACED)
+    initial_std: float = setting(0.5, Range.POSITIVE, Reader.STD, Mark.TRACED)
     """Standard deviation of the actions before training, in the action's unit."""
     final_std: float | None = _for_reinforce(
-        None, *POSITIVE, Reader.DECAY, Reader.FREE_STD, Mark.TRACED
+        None, Range.POSITIVE, Reader.DECAY, Reader.FREE_STD, Mark.TRACED
     )
     """Target of the standard deviation of the actions, reached over --decay-steps besides what
     is learned. With --max-kl it may stay above. None: learned only."""
     normalize_steps: int | None = setting(1000, Range.AT_LEAST_0, Range.INT32)
     """Scale observations by their mean and standard deviation over about this many first steps. 0:
     do not scale. None: update the statistics throughout training."""
-    normalize_min_std: float = setting(0.0, *NOT_NEGATIVE, Reader.NORMALIZATION, Mark.TRACED)
+    normalize_min_std: float = setting(0.0, Range.NOT_NEGATIVE, Reader.NORMALIZATION, Mark.TRACED)
     """Lower bound on the std that scales observations, in the observation's unit: an entry that
     barely varies in the first steps would be magnified."""
 
@@ -182,16 +170,20 @@ class EstimatorSettings:
     explain them. Or module:name."""
     discount: float = _for_gradients(0.99, Range.SHARE, Mark.TRACED)
     """Discount of rewards, in [0, 1]."""
-    standardize_floor: float | None = _for_reinforce(10.0, *NOT_NEGATIVE, Mark.TRACED)
+    standardize_floor: float | None = _for_reinforce(10.0, Range.NOT_NEGATIVE, Mark.TRACED)
     """The weights are divided by their standard deviation plus this number, in units of return.
     None: they are not divided."""
-    value_learning_rate: float = _for_gradients(3e-3, *RATE, Reader.VALUE_BASELINE, Mark.TRACED)
+    value_learning_rate: float = _for_gradients(
+        3e-3, Range.POSITIVE, Reader.VALUE_BASELINE, Mark.TRACED
+    )
     """Adam's learning rate for the value network of value-baseline."""
-    value_fits: int = _for_reinforce(32, *STEPS, Reader.VALUE_BASELINE)
+    value_fits: int = _for_reinforce(32, *COUNT, Reader.VALUE_BASELINE)
     """Gradient steps of the value network in each update, on the squared error."""
     value_batch_size: int = _for_reinforce(256, *COUNT, Reader.VALUE_BASELINE)
     """Env steps in each minibatch of the value network, drawn with replacement."""
-    value_hidden_sizes: tuple[int, ...] = _for_gradients((64, 64), *LAYERS, Reader.VALUE_BASELINE)
+    value_hidden_sizes: tuple[int, ...] = _for_gradients(
+        (64, 64), Range.LAYERS, Reader.VALUE_BASELINE
+    )
     """Units of each tanh layer of the value network."""
 
 
@@ -202,23 +194,25 @@ class UpdateSettings:
     update: Literal["full-batch", "natural-gradient"] = _for_reinforce("full-batch")
     """How a rollout changes the policy. full-batch: one optimizer step. natural-gradient: one
     step of length --max-kl, which a decay of the learning rate shortens."""
-    entropy_cost: float = _for_reinforce(0.0, *NOT_NEGATIVE, Mark.TRACED)
+    entropy_cost: float = _for_reinforce(0.0, Range.NOT_NEGATIVE, Mark.TRACED)
     """Weight of the policy's entropy in the objective."""
     optimizer: Literal["adam", "sgd"] = _for_reinforce("adam", Reader.OPTIMIZER)
     """The rule that turns a gradient into a step."""
-    learning_rate: float = _for_gradients(1e-2, *RATE, Reader.FIRST_RATE, Mark.TRACED)
+    learning_rate: float = _for_gradients(1e-2, Range.POSITIVE, Reader.FIRST_RATE, Mark.TRACED)
     """Learning rate of the optimizer at the start of training."""
     momentum: float = _for_reinforce(0.9, Range.BELOW_1, Reader.OPTIMIZER, Reader.ADAM, Mark.TRACED)
     """b1 of adam: the share of the last mean gradient that the next one keeps."""
-    final_learning_rate: float | None = _for_reinforce(None, *RATE, Reader.DECAY, Mark.TRACED)
+    final_learning_rate: float | None = _for_reinforce(
+        None, Range.POSITIVE, Reader.DECAY, Mark.TRACED
+    )
     """Learning rate after the linear decay. If not given, a tenth of --learning-rate."""
     decay_steps: int | Literal["budget"] | None = _for_reinforce("budget", *TOTAL, Mark.TRACED)
     """Env steps of a seed over which the learning rate decays, and with --final-std also the
     noise. budget: the length of the run. None: no decay."""
-    max_grad_norm: float | None = _for_reinforce(1.0, *POSITIVE, Reader.OPTIMIZER, Mark.TRACED)
+    max_grad_norm: float | None = _for_reinforce(1.0, Range.POSITIVE, Reader.OPTIMIZER, Mark.TRACED)
     """Maximum Euclidean norm of the gradient; a longer gradient is scaled down. None: no
     maximum."""
-    max_kl: float | None = _for_reinforce(None, *POSITIVE, Mark.TRACED)
+    max_kl: float | None = _for_reinforce(None, Range.POSITIVE, Mark.TRACED)
     """Approximate maximum of the mean KL divergence, in nats, between the policies before and
     after an update, over the visited steps. A larger change is shortened. None: no maximum."""
 

@@ -13,7 +13,7 @@ from mjx_reinforce.registry import (
     load_choice,
     load_definition,
 )
-from mjx_reinforce.settings.config import Config, check_step_count
+from mjx_reinforce.settings.config import Config
 
 if TYPE_CHECKING:
     import optax
@@ -54,7 +54,6 @@ def build(
 
     check_environment(env)
     horizon = check_horizon(env, config.horizon)
-    check_step_count(config, horizon)
     forever = config.normalize_steps is None
     shared = {
         "policy": build_policy(policy_settings(env, config)) if policy is None else policy,

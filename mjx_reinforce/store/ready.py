@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from mjx_reinforce import envs
 from mjx_reinforce.engine.base import Environment
 from mjx_reinforce.learning.learner import Learner
-from mjx_reinforce.settings.config import Config, check_read_by_policy, check_step_count
+from mjx_reinforce.settings.config import Config, check_read_by_policy
 from mjx_reinforce.store import kept
 from mjx_reinforce.store.build import build, policy_settings
 from mjx_reinforce.training.division import Division, divide_run
@@ -75,7 +75,6 @@ def _found(key: str, config: Config) -> Ready | None:
         return None
     facts, programs = found
     programs = programs._replace(division=divide_run(config))
-    check_step_count(config, facts["horizon"])
     return Ready(**facts, engine_seconds=0.0, programs=lambda: programs)
 
 

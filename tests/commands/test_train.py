@@ -17,7 +17,7 @@ from toys import Survive
 from mjx_reinforce import load, load_policy
 from mjx_reinforce.files import append, csv_text
 from mjx_reinforce.learning import normalize
-from mjx_reinforce.settings.config import MAX_OF_UPDATE, Config, check_step_count
+from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import smooth
 from mjx_reinforce.store.build import build
 
@@ -177,33 +177,6 @@ def test_the_garbage_collector_runs_after_every_way_out(run, arguments):
     assert gc.isenabled()
     run(*arguments)
     assert gc.isenabled()
-
-
-@pytest.mark.parametrize(
-    ("settings", "most"),
-    [
-        # 320 env steps an update, all of which the last one before the budget may add.
-        ({"env_steps": None, "max_updates": 100}, 32_000),
-        ({"env_steps": 1000, "max_updates": None}, 1319),
-        ({"env_steps": 1000, "max_updates": 3}, 960),
-        ({"env_steps": 1000, "max_updates": 100}, 1319),
-    ],
-)
-def test_env_steps_that_cannot_be_counted_are_refused(monkeypatch, settings, most):
-    config = Config(num_episodes=16, **settings)
-    monkeypatch.setattr("mjx_reinforce.settings.config.MAX_COUNT", most)
-    check_step_count(config, horizon=20)
-    monkeypatch.setattr("mjx_reinforce.settings.config.MAX_COUNT", most - 1)
-    with pytest.raises(ValueError, match=f"a seed may play {most:,} env steps"):
-        check_step_count(config, horizon=20)
-
-
-def test_an_update_that_cannot_be_counted_is_refused():
-    config = Config(num_episodes=2**21, env_steps=10**12)
-    check_step_count(config, horizon=2**10 - 1)
-    with pytest.raises(ValueError, match="an update may play 2,147,483,648 env steps"):
-        check_step_count(config, horizon=2**10)
-    assert jnp.iinfo(jnp.int32).max == MAX_OF_UPDATE
 
 
 def test_a_ready_policy_may_be_trained():
