@@ -103,7 +103,6 @@ def film(settings: WatchSettings) -> None:
     configure_jax()
     roles = cast(settings, run)
     env = envs.make_set(run.env, run.env_set)
-    _check_observations(env, roles[-1].player, run)
     model = scene(env)
     size = settings.width, settings.height
     renderer = Renderer(model, *size)  # raises before anything is compiled
@@ -204,17 +203,6 @@ def untrained(player: "Player") -> "Player":
     params = player.policy.init(jax.random.key(player.seed))
     actor = Actor(params=params, normalizer=normalize.init(player.observation_size))
     return player._replace(actor=actor)
-
-
-def _check_observations(env: "Environment", player: "Player", run: Run) -> None:
-    """Raises ValueError for a policy of a run whose observations are not the environment's."""
-    from mjx_reinforce.engine.base import observation_size
-
-    if (size := observation_size(env)) != player.observation_size:
-        raise ValueError(
-            f"the policy in {run.directory} takes observations of {player.observation_size} "
-            f"entries, {run.env} has {size}: config.json and policy/ are of different runs"
-        )
 
 
 def _simulator(

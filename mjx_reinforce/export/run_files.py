@@ -147,14 +147,7 @@ def choose_seed(run: Run, seed: SeedChoice, which: Which = "last") -> int:
     order = np.argsort(returns, kind="stable")
     ranked = {"worst": order[0], "median": order[(len(order) - 1) // 2], "best": returns.argmax()}
     place = int(ranked[seed])
-    if run.seeds is None:
-        return place
-    if len(run.seeds) != len(returns):
-        raise ValueError(
-            f"{run.directory / 'summary.json'} ranks {len(returns)} seeds, config.json names "
-            f"{len(run.seeds)}: they are of different runs"
-        )
-    return run.seeds[place]
+    return place if run.seeds is None else run.seeds[place]
 
 
 def final_returns(run: Run, which: Which) -> np.ndarray:

@@ -14,7 +14,7 @@ from mjx_reinforce.reports import charts, words
 from mjx_reinforce.reports.charts import curves, distribution, final, profile, sensitivity, solved
 from mjx_reinforce.reports.experiment import Experiment, counted, say, setting_in_words
 from mjx_reinforce.reports.findings import COMPARED, Findings
-from mjx_reinforce.reports.listings import key_figures, listings
+from mjx_reinforce.reports.listings import listings
 from mjx_reinforce.reports.words import steps
 
 #: The charts in the order of the page.
@@ -74,7 +74,6 @@ def render(
         loader=jinja2.FunctionLoader(_read_template),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
-        finalize=_unbroken,
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -84,7 +83,6 @@ def render(
         watch=watch,
         moments=stops,
         date=f"{datetime.date.today():%d %B %Y}".lstrip("0"),
-        size=_size_in_words(results),
         version=version,
         seconds=f"{seconds:.1f} s",
         findings=findings,
@@ -101,15 +99,6 @@ def _read_template(name: str) -> str:
     return (_TEMPLATES / name).read_text(encoding="utf-8")
 
 
-def _unbroken(value: object) -> Any:
-    """Returns a text in which no line breaks "95 %" and "p = 0.01", and anything else as it is."""
-    if type(value) is not str:
-        return value
-    for broken in (" %", "p = ", "p < "):
-        value = value.replace(broken, broken.replace(" ", "\u00a0"))
-    return value
-
-
 def _json(value: object) -> str:
     """Returns JSON that cannot end the script element that it is in."""
     text = json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
@@ -121,11 +110,6 @@ def encoded(text: str) -> bytes:
     return text.encode(errors="backslashreplace")
 
 
-def _size_in_words(text: str) -> str:
-    size = len(encoded(text))
-    return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{max(1, round(size / 1e3))} kB"
-
-
 def _text(findings: Findings, drawn: list[charts.Chart]) -> dict[str, Any]:
     """Returns the text of the page, without the provenance of its numbers."""
     figures = {figure.name: figure for figure in drawn}
@@ -135,7 +119,6 @@ def _text(findings: Findings, drawn: list[charts.Chart]) -> dict[str, Any]:
     failures = any(not math.isfinite(x) for each in findings.results for x in each.final)
     return {
         "answer": words.headline(findings),
-        "key_figures": key_figures(findings),
         "distrust": list(words.caveats(findings)),
         "figures": {name: figures.get(name) for name in names},
         "failures": failures,

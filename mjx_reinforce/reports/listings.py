@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.reports import words
-from mjx_reinforce.reports.experiment import counted
 from mjx_reinforce.reports.findings import COMPARED, Findings, Result, SpeedTest, worst_seeds
 from mjx_reinforce.reports.words import interval_in_words, number, percent, short_p, steps
 from mjx_reinforce.statistics import Estimate
@@ -35,23 +34,6 @@ def _row(result: Result, cells: Sequence[tuple[str, str]]) -> dict[str, Any]:
 def _cell(estimate: Estimate, form: Callable[[float], str] = number) -> tuple[str, str]:
     """Returns an estimate in words, and its interval below it."""
     return form(float(estimate.value)), interval_in_words(estimate, form)
-
-
-def key_figures(findings: Findings) -> list[tuple[str, str, str]]:
-    """Returns the few numbers that stand out: name, value, what is below."""
-    best = findings.results[0]
-    seeds = sum(len(each.final) for each in findings.results)
-    ends = max(int(each.configuration.env_steps[-1].max()) for each in findings.results)
-    configurations = counted(len(findings.results), "configuration")
-    mean = "return of the best" if findings.comparisons else "mean return"
-    found = [("seeds trained", f"{seeds:,}", configurations), (mean, *_cell(best.mean))]
-    if (solving := best.solving) is not None:
-        said = f"of {len(best.final):,}; {interval_in_words(solving.rate, percent)}"
-        found.append(("seeds that solve it", f"{solving.at_end:,}", said))
-        found.append(("env steps until half", *_cell(solving.median, steps)))
-    else:
-        found.append(("worst tenth", *_cell(best.tail)))
-    return [*found, ("env steps a seed", f"{ends:,}", "at most")]
 
 
 def _results_table(findings: Findings) -> Listing:

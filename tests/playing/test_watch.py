@@ -140,15 +140,6 @@ def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):
     assert error.count("\n") == 1
 
 
-def test_a_policy_of_another_environment_is_named(tmp_path, monkeypatch, capsys):
-    make_run(tmp_path)
-    change_env(tmp_path, "Reacher-v5")
-    with pytest.raises(SystemExit, match="2"):
-        watch_run(monkeypatch, tmp_path)
-    error = capsys.readouterr().err
-    assert "takes observations of 4 entries, Reacher-v5 has 10" in error
-
-
 def test_a_gif_has_the_colours_of_the_samples():
     """They are more than 256, the second half of them in the later samples alone."""
     ramp = np.arange(256, dtype=np.uint8)

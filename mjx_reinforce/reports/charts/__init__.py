@@ -11,6 +11,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from importlib import resources
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,28 +31,28 @@ SHOWN = 4
 #: Moments that the page's slider stops at, at most.
 _MOMENTS = 30
 
-#: Okabe and Ito's colours, told apart by colour-blind people (https://jfly.uni-koeln.de/color/);
-#: without their yellow, which is lost on white.
-_SERIES_LIGHT = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b87a00", "#56b4e9", "#4d4d4d")
-_SERIES_DARK = ("#4aa8e0", "#f2803a", "#2cc79a", "#e39cc4", "#e69f00", "#8fd0f7", "#c8c8c8")
-_GROUND = {
-    "light": {"paper": "#ffffff", "ink": "#1b1b1b", "soft": "#5c5c5c", "line": "#d9d9d6"},
-    "dark": {"paper": "#16181b", "ink": "#ececea", "soft": "#a9abae", "line": "#3a3d42"},
-}
-LIGHT = _GROUND["light"] | {f"series-{i}": colour for i, colour in enumerate(_SERIES_LIGHT)}
-DARK = _GROUND["dark"] | {f"series-{i}": colour for i, colour in enumerate(_SERIES_DARK)}
-#: Dashes, as lengths of strokes and gaps; not as many as colours, so that pairs repeat late.
-_DASHES = ([1, 0], [7, 3], [2, 2], [9, 3, 2, 3])
+_LOOK = json.loads(
+    (resources.files("mjx_reinforce.reports") / "files" / "look.json").read_text("utf-8")
+)
+#: Colours by name. Those of the configurations are Okabe and Ito's, told apart by colour-blind
+#: people (https://jfly.uni-koeln.de/color/), without their yellow, which is lost on white.
+LIGHT, DARK = _LOOK["light"], _LOOK["dark"]
+#: How all charts look, for Vega-Lite.
+CONFIG = _LOOK["config"]
+_NUM_COLOURS = sum(name.startswith("series-") for name in LIGHT)
 
 
 def colour(place: int) -> str:
     """Returns the colour of the configuration at a place."""
-    return f"var(--series-{place % len(_SERIES_LIGHT)})"
+    return f"var(--series-{place % _NUM_COLOURS})"
 
 
 def dash(place: int) -> list[int]:
-    """Returns its dashes."""
-    return _DASHES[place % len(_DASHES)]
+    """Returns its dashes, as lengths of strokes and gaps.
+
+    They are not as many as colours, so that pairs repeat late.
+    """
+    return _LOOK["dashes"][place % len(_LOOK["dashes"])]
 
 
 def in_light(text: str) -> str:
@@ -79,25 +80,6 @@ STEPS = quantity(
 _CONFIGURATION = {"field": "configuration", "type": "nominal"}
 #: Data of one row, of what is drawn once.
 _ONCE = {"values": [{}]}
-#: Pixels of a configuration's name in a legend, at most.
-_LABEL_LIMIT = 420
-_TEXT = {"labelColor": "var(--ink)", "titleColor": "var(--soft)", "titleFontWeight": "normal"}
-_SIZES = {"labelFontSize": 12, "titleFontSize": 12}
-_AXIS = {"gridColor": "var(--line)", "domainColor": "var(--soft)", "tickColor": "var(--soft)"}
-_ABOVE = {"titleAlign": "left", "titleAngle": 0, "titleAnchor": "start", "titleX": 0, "titleY": -12}
-_SYMBOLS = {"symbolStrokeWidth": 2.5, "symbolSize": 300, "labelLimit": _LABEL_LIMIT}
-#: How all charts look.
-CONFIG = {
-    "font": "ui-sans-serif, system-ui, 'Helvetica Neue', Arial, 'Liberation Sans', sans-serif",
-    "background": None,
-    "view": {"stroke": None},
-    "axis": {**_TEXT, **_SIZES, **_AXIS, "gridOpacity": 0.7, "labelOverlap": True},
-    "axisX": {"grid": False, "tickCount": 6},
-    "axisY": {"domain": False, "ticks": False, "tickCount": 5, **_ABOVE},
-    "legend": {**_TEXT, **_SIZES, **_SYMBOLS},
-    "text": {"color": "var(--ink)", "fontSize": 12},
-    "rule": {"color": "var(--soft)"},
-}
 
 
 def rows(table: Table, labels: Sequence[str]) -> list[dict[str, Any]]:
@@ -233,7 +215,7 @@ def _by_place(labels: Sequence[str], looks: Sequence[Any], *, legend: bool = Tru
     It has as many columns as the page has room for. Not as the chart has: that is narrowed to leave
     room for the axis once the legend is laid out.
     """
-    column = min(7 * max(map(len, labels)), _LABEL_LIMIT) + 50
+    column = min(7 * max(map(len, labels)), CONFIG["legend"]["labelLimit"]) + 50
     columns = f"max(1, floor((width && containerSize()[0] || width) / {column}))"
     place = {"title": None, "orient": "top", "direction": "horizontal", "offset": 36}
     place |= {"columns": {"expr": columns}, "values": {"expr": "shown"}}
