@@ -432,15 +432,6 @@ def test_words_that_nobody_reads_end_no_sweep_of_a_script(monkeypatch):
         nobody.close()
 
 
-@pytest.mark.parametrize("columns", ["1", "x"])
-def test_help_is_of_some_hundred_lines_on_every_terminal(monkeypatch, capsys, columns):
-    monkeypatch.setenv("COLUMNS", columns)
-    with pytest.raises(SystemExit, match="0"):
-        parse(["--help", "all"])
-    assert capsys.readouterr().out.count("\n") < 500
-    assert os.environ["COLUMNS"] == columns
-
-
 # At random.
 
 _FIELDS = {field.name: field.type for field in dataclasses.fields(Config)}
