@@ -45,10 +45,7 @@ _ONE_NUMBER = "give one number"
 _ONE_SIGN = "give two positive numbers, or two that are not"
 _RISING = "give a second number that is not below it, and a width above zero"
 #: Fields of a model that say how soft its constraints are.
-_SOFT = (
-    *("dof_{}", "eq_{}", "geom_{}", "jnt_{}", "pair_{}"),
-    *("tendon_{}_lim", "tendon_{}_fri"),
-)
+_SOFT = ("dof_{}", "eq_{}", "geom_{}", "jnt_{}", "pair_{}", "tendon_{}_lim", "tendon_{}_fri")
 _NO_WIDTH = 1e-15  # mjMINVAL
 #: What else MJX ignores in silence.
 _IGNORED = (

@@ -80,9 +80,7 @@ def to_screen(text: str) -> None:
 
 @contextlib.contextmanager
 def heartbeat(
-    say: Callable[[str], None],
-    what: str = "compiling",
-    interval: float = _INTERVAL,
+    say: Callable[[str], None], what: str = "compiling", interval: float = _INTERVAL
 ) -> Iterator[None]:
     """Says again and again, while its block runs, that it goes on.
 

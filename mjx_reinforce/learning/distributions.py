@@ -267,11 +267,7 @@ class GaussianOutputs(NamedTuple):
 
 
 def gaussian_outputs(
-    name: str,
-    space: Box | Discrete,
-    std: str,
-    initial_std: float | jax.Array,
-    rescale: bool,
+    name: str, space: Box | Discrete, std: str, initial_std: float | jax.Array, rescale: bool
 ) -> GaussianOutputs:
     """Checks the arguments of a Gaussian family and returns the layout of its outputs.
 

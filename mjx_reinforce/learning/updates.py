@@ -230,9 +230,7 @@ def signal_to_noise(mean: Params, each: Params, num_episodes: int) -> jax.Array:
 
 
 def accumulate_gradient(
-    loss: Callable[[Any, Any], tuple[jax.Array, Any]],
-    params: Params,
-    data: tuple[Any, ...],
+    loss: Callable[[Any, Any], tuple[jax.Array, Any]], params: Params, data: tuple[Any, ...]
 ) -> tuple[jax.Array, Any, Any]:
     """Sums a loss, its gradient and its metrics over chunks of time.
 

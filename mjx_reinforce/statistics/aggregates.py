@@ -19,11 +19,7 @@ _LEAST_TAIL = 5
 
 
 def interval(
-    statistic: str,
-    values: ArrayLike,
-    *,
-    confidence: float = 0.95,
-    fraction: float = 0.1,
+    statistic: str, values: ArrayLike, *, confidence: float = 0.95, fraction: float = 0.1
 ) -> Estimate:
     """Returns a statistic over seeds with its confidence interval.
 

@@ -188,8 +188,7 @@ def best_rates(task: Task, contrast: Contrast, seeds: slice) -> tuple[float, flo
     rates = task.factors["learning_rate"]
     first, second = (
         max(
-            rates,
-            key=lambda rate: arm(task, "average return", contrast, level, rate)[seeds].mean(),
+            rates, key=lambda rate: arm(task, "average return", contrast, level, rate)[seeds].mean()
         )
         for level in contrast.levels
     )

@@ -157,9 +157,7 @@ def _unpack(values: jax.Array, touching: jax.Array) -> jax.Array:
 
     def give(count: jax.Array, touches: jax.Array) -> tuple[jax.Array, jax.Array]:
         return lax.cond(
-            touches,
-            lambda: (count + 1, values[count]),
-            lambda: (count, jnp.zeros_like(values[0])),
+            touches, lambda: (count + 1, values[count]), lambda: (count, jnp.zeros_like(values[0]))
         )
 
     return lax.scan(give, jnp.int32(0), touching)[1].reshape(-1)

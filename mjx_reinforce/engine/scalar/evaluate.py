@@ -10,11 +10,7 @@ from mjx_reinforce.engine.scalar import arrays, jaxprs
 from mjx_reinforce.engine.scalar.graph import Graph
 from mjx_reinforce.engine.scalar.rules import indexing, loops, reductions, structural
 
-_ARRAY_RULES = {
-    **structural.RULES,
-    **reductions.RULES,
-    **indexing.RULES,
-}
+_ARRAY_RULES = {**structural.RULES, **reductions.RULES, **indexing.RULES}
 #: What makes keys of words and words of keys.
 _KEYS_TO_WORDS = ("random_wrap", "random_unwrap")
 _CONTROL = {

@@ -67,12 +67,7 @@ class CText(Backend[str]):
     reports: what the physics reports, by the names of ``device/state.h``.
     """
 
-    def __init__(
-        self,
-        written: scalarized.Scalarized,
-        inputs: Callable[[int], str],
-        skip: int,
-    ):
+    def __init__(self, written: scalarized.Scalarized, inputs: Callable[[int], str], skip: int):
         """Says where what is not computed here is.
 
         Args:
