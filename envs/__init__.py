@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from mjx_reinforce.engine import checks
 from mjx_reinforce.engine.checks import BadEnvironmentError
 from mjx_reinforce.engine.physics import silence_mjx
-from mjx_reinforce.registry import load_ours, load_own
+from mjx_reinforce.registry import load_definition, load_own
 
 if TYPE_CHECKING:
     from mjx_reinforce.engine.base import Environment
@@ -163,7 +163,7 @@ def _import(id: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:
     """Returns the class or function of an entry of the table, or of "module:Class"."""
     if ":" in id:
         return load_own("environment", id, form="module:Class")
-    return load_ours("environment", id, entry)
+    return load_definition(entry)
 
 
 def check_id(id: str) -> None:

@@ -74,9 +74,6 @@ ALGORITHMS = {
     ),
 }
 
-#: What the system's loader says of a library for which there is no memory.
-_NO_MEMORY = ("failed to map segment", "cannot allocate memory", "Cannot allocate memory")
-
 
 def find_algorithm(name: str) -> Algorithm:
     """Returns a way to learn by its name; that of the user's own, module:name, may be any."""
@@ -122,33 +119,19 @@ def load_own(kind: str, name: str, *, form: str = "module:name") -> Callable[...
     """
     if not {"", os.getcwd()} & set(sys.path):  # python -m has it, a script has not
         sys.path.insert(0, os.getcwd())
-    remedy = f"write {form} of a module that is in this folder or installed"
-    made = _imported(kind, name, name, remedy)
+    try:
+        made = load_definition(name)
+    except (Exception, SystemExit) as error:  # an import runs the user's code
+        raise ValueError(
+            f"cannot import the {kind} {name!r}: {explain(error)}; write {form} of a module that "
+            "is in this folder or installed"
+        ) from error
     if not callable(made):
         raise ValueError(
             f"the {kind} {name!r} is no class or function, but of type {type(made).__name__}; "
             f"write {form}"
         )
     return made
-
-
-def load_ours(kind: str, name: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:
-    """Returns the definition of an entry of a table; ValueError if it cannot be imported."""
-    remedy = "see whether what this package needs is installed: pip check"
-    return _imported(kind, name, entry, remedy)
-
-
-def _imported(
-    kind: str, name: str, entry: str | Callable[..., Any], remedy: str
-) -> Callable[..., Any]:
-    try:
-        return load_definition(entry)
-    except (Exception, SystemExit) as error:  # an import runs the user's code
-        if isinstance(error, MemoryError) or any(text in str(error) for text in _NO_MEMORY):
-            remedy = "there is not enough memory for the libraries: see ulimit -v"
-        raise ValueError(
-            f"cannot import the {kind} {name!r}: {explain(error)}; {remedy}"
-        ) from error
 
 
 def load_definition(entry: str | Callable[..., Any]) -> Callable[..., Any]:
