@@ -20,18 +20,14 @@ from mjx_reinforce.settings.tables import PRESETS
 
 Form = TypeVar("Form")
 
-#: How numbers and paths are read, everywhere.
+#: How whole numbers and paths are read, everywhere.
 _READERS = ConstructorRegistry()
 
 
 @_READERS.primitive_rule
 def _reader(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """Returns how a number or a path is read: 1e6 is a whole number, and "" is no path."""
-    readers = {
-        int: ("INT", whole_number),
-        float: ("FLOAT", _real_number),
-        Path: ("PATH", _read_path),
-    }
+    """Returns how a whole number or a path is read: 1e6 is a whole number, and "" is no path."""
+    readers = {int: ("INT", whole_number), Path: ("PATH", _read_path)}
     if kind.type not in readers:
         return None
     metavar, reader = readers[kind.type]
@@ -42,13 +38,6 @@ def _reader(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
         is_instance=lambda value: isinstance(value, kind.type),
         str_from_instance=lambda value: [str(value)],
     )
-
-
-def _real_number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(f"takes a number, such as 0.5, got {text!r}") from None
 
 
 def _read_path(text: str) -> Path:

