@@ -122,7 +122,7 @@ def test_flags_of_pages_exist(capfd):
     for path in sorted(DOCS.glob("*.md")):
         for code in blocks(path.read_text("utf-8"), "sh"):
             for line in code.replace("\\\n", " ").splitlines():
-                if re.search(rf"mjx-reinforce ({'|'.join(COMMANDS)})", line):
+                if re.search(rf"mjx_reinforce\.({'|'.join(COMMANDS)})\b", line):
                     said |= dict.fromkeys(re.findall(r"(?<= )--[a-z][a-z-]+", line), path.name)
     assert len(said) > 10
     assert {flag: page for flag, page in said.items() if flag not in known} == {}

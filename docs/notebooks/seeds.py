@@ -71,4 +71,4 @@ fig.savefig("seeds.png", dpi=90)
 # 1. Compare medians in place of means.
 # 2. Draw the *same* seeds for both configurations: does pairing help?
 # 3. Sweep `learning_rate` in place of `discount`, or three values of both.
-# 4. `mjx-reinforce sweep ... --output rates` writes a page that says all of this, and more.
+# 4. `python -m mjx_reinforce.sweep ... --output rates` writes a page that says all of this, and more.

@@ -5,9 +5,9 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 
-def percent(share: float, digits: int) -> str:
+def percent(share: float, digits: int, unit: str = " %") -> str:
     """Returns a share in percent; nothing where there is none."""
-    return "" if math.isnan(share) else f"{fixed(100 * share, digits)} %"
+    return "" if math.isnan(share) else f"{fixed(100 * share, digits)}{unit}"
 
 
 def fixed(x: float, digits: int) -> str:

@@ -127,7 +127,7 @@ def test_the_tables_say_what_the_numbers_are(tasks, tmp_path, monkeypatch):
     assert "| Up-v0 | 0 | 50 | 32 and 32 | 1,000 | 0.0 % | 0 | vmap | 1 s, 2 s |" in text
     row = next(x for x in text.splitlines() if x.startswith(f"| {LEARNED.name} | Up-v0 |"))
     assert "**+5." in row
-    assert row.endswith("| 100 % |")
+    assert row.endswith("| 100 |")
     assert f"| final return | Up-v0 | {LEARNED.name} | yes |" in text
     assert text.count("| average return | Down-v0 |") == len(CONTRASTS) + 1
 

@@ -24,10 +24,10 @@ def effects_table(tasks: Sequence[Task], effects: Sequence[Effect]) -> str:
                 rates = group[0].rates
                 spoken = " / ".join(map(_rates, rates)) if rates else "all settings"
                 average = next(e for e in group if e.measure == "average return")
-                better = percent(average.improvement, 0) if rates else ""
+                better = percent(average.improvement, 0, "") if rates else ""
                 cells = [_cell(task, effect) for effect in group]
                 rows.append([contrast.name, task.name, spoken, *cells, better])
-    return table(["", "task", "learning rates", *MEASURES, "better seed"], rows)
+    return table(["", "task", "learning rates", *MEASURES, "better seed (%)"], rows)
 
 
 def _rates(rates: Sequence[float]) -> str:
@@ -50,7 +50,7 @@ def _cell(task: Task, effect: Effect) -> str:
 def _shower(task: Task, measure: str) -> Callable[[float], str]:
     """Returns what writes a value of a measure for people."""
     if measure == "solved at the end":
-        return lambda x: percent(x, 1)
+        return lambda x: percent(x, 1, "")
     if measure == "env steps to solve":
         return lambda x: f"{fixed(x / 1000, 1)}k"
     digits = 0 if abs(task.threshold) >= 1000 else 1 if abs(task.threshold) >= 100 else 2
@@ -63,20 +63,20 @@ def few_table(found: Sequence[FewSeeds]) -> str:
     for x in found:
         cells = ["no", *("equal" for _ in FEW), ""]
         if not x.equal:
-            wrong = [percent(x.wrong[n], 1) for n in FEW]
+            wrong = [percent(x.wrong[n], 1, "") for n in FEW]
             cells = ["yes" if x.sure else "no", *wrong, number(x.needed)]
         rows.append([x.measure, x.task, x.contrast, *cells])
-    header = ["by the mean", "task", "", "sure winner", *(f"{n} seeds" for n in FEW)]
+    header = ["by the mean", "task", "", "sure winner", *(f"{n} seeds (%)" for n in FEW)]
     return table([*header, "seeds for 80 % power"], rows)
 
 
 def pairs_table(found: Sequence[AnyPair]) -> str:
     """Returns the same of any two configurations: a row a task."""
     rows = [
-        [x.measure, x.task, f"{x.pairs:,}", *(percent(x.wrong[n], 1) for n in x.wrong)]
+        [x.measure, x.task, f"{x.pairs:,}", *(percent(x.wrong[n], 1, "") for n in x.wrong)]
         for x in found
     ]
-    header = ["by the mean", "task", "pairs", *(f"{n} seeds" for n in found[0].wrong)]
+    header = ["by the mean", "task", "pairs", *(f"{n} seeds (%)" for n in found[0].wrong)]
     return table(header, rows)
 
 
