@@ -35,7 +35,7 @@ class Range(enum.Enum):
     SEED = "in [0, 2^32)", lambda x: 0 <= x < 2**32
     SHARE = "in [0, 1]", lambda x: 0 <= x <= 1
     BELOW_1 = "in [0, 1 - 2^-24], the last float32 below 1", lambda x: 0 <= x <= 1 - 2**-24
-    LAYERS = "positive in every layer", lambda x: all(n >= 1 for n in x)
+    LAYERS = "in [1, 2^31) in every layer", lambda x: all(1 <= n <= MAX_OF_UPDATE for n in x)
     POSITIVE = "positive and finite", lambda x: math.isfinite(x) and x > 0
     NOT_NEGATIVE = "finite and not negative", lambda x: math.isfinite(x) and x >= 0
 

@@ -77,7 +77,7 @@ def test_sizes_are_for_people():
 
 @pytest.mark.parametrize("settings", [{"num_seeds": 2**31}, {"hidden_sizes": (8, 2**31)}])
 def test_what_no_memory_holds_is_refused(settings):
-    with pytest.raises(ValueError, match=r"must be less than 2\^31"):
+    with pytest.raises(ValueError, match=r"must be .*2\^31"):
         check_design(Design(base=Config(**settings)))
 
 
