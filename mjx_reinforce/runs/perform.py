@@ -9,9 +9,9 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.console.streams import heartbeat
-from mjx_reinforce.files import read_json
 from mjx_reinforce.runs.design import Design, check_design
 from mjx_reinforce.runs.directory import own_directory
+from mjx_reinforce.training.resume import read_record
 
 if TYPE_CHECKING:
     from mjx_reinforce.runs.display import Display
@@ -73,12 +73,11 @@ def perform(
         from mjx_reinforce.runs.sweep_files import SweepFiles
 
         display = Display(quiet=quiet)
-        if design.over and design.resume is not None:
-            known = read_json(design.resume / design.first_file)
-            if known.get("status") == "finished":
-                return Outcome(directory, known, None, {}, display)
+        known = {} if design.resume is None else read_record(design.resume, design.first_file)
+        if known.get("status") == "finished":  # of a sweep
+            return Outcome(directory, known, None, {}, display)
         with heartbeat(display.say, "writing the simulation out"):
-            prepared = prepare(design, env, display.say)
+            prepared = prepare(design, known, env, display.say)
         display.say(describe(prepared))
         with display:
             interrupt.restore_screen(display.console.show_cursor)

@@ -92,20 +92,24 @@ class Prepared(NamedTuple):
         return sum(part.ready.engine_seconds for part in self.parts)
 
 
-def prepare(design: Design, env: Environment | None, say: Callable[[str], None]) -> Prepared:
+def prepare(
+    design: Design,
+    known: Mapping[str, Any],
+    env: Environment | None,
+    say: Callable[[str], None],
+) -> Prepared:
     """Returns what a run or a sweep is made of.
 
     Args:
       design: of it.
+      known: what the first file of its directory says, if it goes on.
       env: the environment of a run, if it is built already.
       say: shows a line to the user.
 
     Raises:
       ValueError: settings do not fit the environment, or it cannot go on here.
     """
-    known = {}
     if design.resume is not None:
-        known = resume.read_record(design.resume, design.first_file)
         resume.check_same_program(design.resume, known, provenance())
     if design.over:
         return _prepare_sweep(design, known)

@@ -1,6 +1,7 @@
 """The design of a sweep: its grid, its groups in chunks."""
 
 import dataclasses
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -123,8 +124,8 @@ BASE = Config(
 OVER = {"num_episodes": [2, 4], "learning_rate": [1e-3, 1e-2, 1e-1]}
 
 
-def prepared(base=BASE, **changes):
-    return prepare(Design(base=base, over=OVER, **changes), None, pytest.fail)
+def prepared(base=BASE, known=MappingProxyType({}), **changes):
+    return prepare(Design(base=base, over=OVER, **changes), known, None, pytest.fail)
 
 
 def test_a_group_is_what_shares_its_programs():
@@ -140,13 +141,12 @@ def test_a_group_is_what_shares_its_programs():
 def test_a_chunk_has_as_many_runs_as_asked_or_as_it_had(monkeypatch, tmp_path):
     assert [part.limit for part in prepared(chunk_runs=4).parts] == [4, 4]
     known = {"chunk_runs": [2, 9], "local_devices": 1}
-    monkeypatch.setattr(plan.resume, "read_record", lambda directory, name: known)
     monkeypatch.setattr(plan.resume, "check_same_program", lambda *given: None)
     base = dataclasses.replace(BASE, resume=tmp_path)
-    assert [part.limit for part in prepared(base, chunk_runs=4).parts] == [2, 9]
+    assert [part.limit for part in prepared(base, known, chunk_runs=4).parts] == [2, 9]
     known["local_devices"] = 3
     with pytest.raises(ValueError, match="was begun on 3 devices, and here are 1"):
-        prepared(base)
+        prepared(base, known)
 
 
 def test_exact_sweeps_have_one_device_and_trace_every_number():
