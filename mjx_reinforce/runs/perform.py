@@ -81,10 +81,8 @@ def perform(
         display.say(describe(prepared))
         with display:
             interrupt.restore_screen(display.console.show_cursor)
-            written = None
-            if directory is not None:
-                kind = SweepFiles if design.over else RunFiles
-                written = kind(directory, prepared, display.say)
+            kind = SweepFiles if design.over else RunFiles
+            written = None if directory is None else kind(directory, prepared, display.say)
             conductor = Conductor(prepared, written, display, observers)
             with display.compiling():
                 conductor.compile_first()
