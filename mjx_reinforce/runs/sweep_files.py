@@ -13,7 +13,7 @@ import numpy as np
 
 from mjx_reinforce.console.commands import typed
 from mjx_reinforce.export.policy_files import actor_of, arrays_of, save_policy
-from mjx_reinforce.files import Arrays, read_arrays, write_arrays, write_json
+from mjx_reinforce.files import Arrays, read_arrays, remove_parts, write_arrays, write_json
 from mjx_reinforce.reports.experiment import lengthened
 from mjx_reinforce.runs.design import as_record, configure
 from mjx_reinforce.runs.plan import Part, Prepared
@@ -78,6 +78,7 @@ class SweepFiles(Files[Training]):
         self._write_json("sweep.json", self.contents)
         super().open()
         self._parts.mkdir(exist_ok=True)
+        remove_parts(*self._parts.glob("*/"))  # of checkpoints
 
     def has(self, chunk: str) -> bool:
         """Returns whether the runs of a chunk have ended."""
@@ -127,8 +128,7 @@ class SweepFiles(Files[Training]):
         record = driver.record
         assert isinstance(record, ChunkRecord)
         runs, actors = record.runs, arrays_of(driver.slots.states().train_states.actor)
-        facts = {"configuration": runs.configuration, "seed": runs.seed}
-        found = record.curves() | facts | {"nonfinite": record.nonfinite}
+        found = record.curves() | runs._asdict() | {"nonfinite": record.nonfinite}
         curves = {name: found[name].astype(kind) for name, kind in _CURVES.items()}
         policies = {f"actor/{name}": np.asarray(x) for name, x in actors.items()}
         write_arrays(self._path(runs.name), curves | policies)
