@@ -1,4 +1,4 @@
-"""``mjx-reinforce new my_arm.xml`` writes the class of an environment from a MuJoCo model."""
+"""``python -m mjx_reinforce.new arm.xml`` writes the class of a task from a MuJoCo model."""
 
 import dataclasses
 import json
@@ -61,7 +61,7 @@ def write_class(settings: NewSettings) -> None:
     models.to_mjx(model, path)
     write_bytes(output, class_source(model, xml.name, output.stem).encode())
     module = output.stem
-    train = f"mjx-reinforce train --env {module}:{_title(module)} --output {module}_run"
+    train = f"python -m mjx_reinforce.train --env {module}:{_title(module)} --output {module}_run"
     print(f"{output}: write its reward, then, in its folder: {train}")
 
 

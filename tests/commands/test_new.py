@@ -62,7 +62,7 @@ def test_a_model_becomes_a_class_that_plays(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write(monkeypatch, "my_robot-2.xml")
     said = capsys.readouterr().out
-    assert "mjx-reinforce train --env my_robot_2:MyRobot2 --output my_robot_2_run" in said
+    assert "python -m mjx_reinforce.train --env my_robot_2:MyRobot2 --output my_robot_2_run" in said
     monkeypatch.syspath_prepend(tmp_path)
     env = envs.make("my_robot_2:MyRobot2")
     state = jax.eval_shape(env.reset, jax.random.key(0))
