@@ -297,7 +297,7 @@ class MujocoEnv(Env):
         results = {jax.tree_util.keystr(path): leaf for path, leaf in paths}
         sound = jax.ShapeDtypeStruct((), bool)
         given = [getattr(start, name) for name in ("ctrl", *models.CARRIED)]
-        made = whole(name, results | {"sound": sound}, *given, owner=self)
+        made = whole(name, results | {"sound": sound}, *given, owner=hex(id(self)))
         *leaves, is_sound = made.values()
         return tree.unflatten(leaves), is_sound
 

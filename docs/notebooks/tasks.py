@@ -1,9 +1,8 @@
 # %% [markdown]
 # # A minute on each task
 #
-# The default settings of a task follow the time that you have and the machine that you are on. Here each task gets
-# the same number of seconds of training, with two seeds. Compiling comes on top: a few seconds for Reacher, half a
-# minute for Walker2d.
+# By default, a task trains for about a minute on two cores or on a GPU, or for less where more does not help. Here each
+# task trains two seeds. Compiling comes on top.
 
 # %%
 import time

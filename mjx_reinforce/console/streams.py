@@ -72,12 +72,6 @@ def say_error(message: str) -> None:
 _INTERVAL = 15.0
 
 
-def to_screen(text: str) -> None:
-    """Prints a line before there is a display; one that the screen does not take is lost."""
-    with contextlib.suppress(OSError):
-        print(text, flush=True)
-
-
 @contextlib.contextmanager
 def heartbeat(
     say: Callable[[str], None], what: str = "compiling", interval: float = _INTERVAL

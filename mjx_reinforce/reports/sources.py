@@ -247,7 +247,7 @@ def _read_run(directory: Path, config: dict[str, Any]) -> Source:
     columns = read_metrics(directory / "metrics.csv", first)
     num_seeds = len(columns["seed"])
     with naming_damage(path):
-        counts = summary.get("nonfinite", [0] * num_seeds)
+        counts = summary.get("nonfinite") or [0] * num_seeds  # a list of events, once
         check_type("nonfinite", counts, tuple[int, ...])
         nonfinite = np.array(counts, np.int64)
         outcome = _outcome(summary)

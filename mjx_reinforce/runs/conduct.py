@@ -19,7 +19,7 @@ from mjx_reinforce.runs.saving import Files
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.store.ready import Ready
 from mjx_reinforce.training.checkpoint import Checkpoint
-from mjx_reinforce.training.driver import Driver, Observer, Training
+from mjx_reinforce.training.driver import Driver, Observer, Training, check_layout
 from mjx_reinforce.training.progress import HOPELESS, Progress
 from mjx_reinforce.training.record import ChunkRecord, RunRecord, Runs
 from mjx_reinforce.training.slots import Compiled, Slots, Stopwatch, compile_slots, started
@@ -45,8 +45,8 @@ class Conductor(Observer[Training]):
           observers: who sees it, besides these.
         """
         self._prepared, self._files, self._display = prepared, files, display
-        shown = [display, *observers] if prepared.alone else [self]
-        self._observers: list[Observer[Any]] = [*([] if files is None else [files]), *shown]
+        written = [] if files is None else [files]
+        self._observers = [*written, display if prepared.alone else self, *observers]
         self._clock = Stopwatch()
         #: The groups that have runs to be trained, and these in chunks.
         self._stages: list[tuple[Part, list[Runs]]] = []
@@ -81,7 +81,7 @@ class Conductor(Observer[Training]):
         driver, ended = None, True
         for part, runs, compiled in self._chunks():
             began, waited = time.perf_counter(), self._clock.compiling
-            driver = self._begin(part, runs, compiled)
+            driver = self._begin(part, runs, compiled, interrupted)
             driver.drive(interrupted)
             for observer in self._observers:
                 observer.ended(driver)
@@ -128,14 +128,16 @@ class Conductor(Observer[Training]):
             for runs in left:
                 yield part, runs, compiled
 
-    def _begin(self, part: Part, runs: Runs, compiled: Compiled) -> Training:
+    def _begin(
+        self, part: Part, runs: Runs, compiled: Compiled, interrupted: Callable[[], bool]
+    ) -> Training:
         """Returns the runs of a chunk where they go on; says which they are."""
         config = dataclasses.replace(part.group.config, num_seeds=len(runs.seed))
         settings = {name: values[runs.place] for name, values in part.group.settings.items()}
         slots = Slots(compiled, runs.seed, settings)
         if self._prepared.alone:
             found, say = self._prepared.found, self._display.say
-            driver = begin_run(config, part.ready, slots, found, say, self._observers)
+            driver = begin_run(config, part.ready, slots, found, say, self._observers, interrupted)
         else:
             driver = Training(config, slots, ChunkRecord(config, runs), self._observers)
         for observer in self._observers:
@@ -174,6 +176,7 @@ def begin_run(
     found: Checkpoint | None = None,
     say: Callable[[str], None] = lambda text: None,
     observers: Sequence[Observer[Any]] = (),
+    interrupted: Callable[[], bool] = lambda: False,
 ) -> Driver:
     """Returns a run before its first update.
 
@@ -184,14 +187,17 @@ def begin_run(
       found: the checkpoint from which it goes on, if any; an observer takes it back there.
       say: shows a line to the user.
       observers: who sees it.
+      interrupted: whether it is to end soon.
     """
+    if found is not None:
+        check_layout(found, slots)  # before a file is touched
     if config.init_from is not None and found is None:
         slots.restore(begin_with(slots.states(), last_actors(config, ready.policy)))
     if config.minutes is not None:
         first = slots.rows()
         if found is not None:
             slots.restore(found.states)
-        env_steps = env_steps_in(60 * config.minutes, slots, config)
+        env_steps = env_steps_in(60 * config.minutes, slots, config, interrupted)
         slots.restore(first)
         say(f"{config.minutes:g} min are about {env_steps:,} env steps of a seed in all here")
         config = dataclasses.replace(config, env_steps=env_steps, minutes=None)
@@ -204,7 +210,9 @@ def begin_run(
 _PART = 0.03
 
 
-def env_steps_in(seconds: float, slots: Slots, config: Config) -> int:
+def env_steps_in(
+    seconds: float, slots: Slots, config: Config, interrupted: Callable[[], bool] = lambda: False
+) -> int:
     """Returns the env steps that a mean seed will have played in all after a time.
 
     The seeds are trained, and evaluated, for a small part of that time. The speed of the second
@@ -215,10 +223,11 @@ def env_steps_in(seconds: float, slots: Slots, config: Config) -> int:
       seconds: the time.
       slots: the seeds, where the run goes on.
       config: the settings.
+      interrupted: whether the first update of the trial is to be the last.
     """
     most = MAX_COUNT if config.max_updates is None else config.max_updates
     began, past = time.perf_counter(), [(0.0, *_played(slots))]
-    while past[-1][0] < _PART * seconds:
+    while past[-1][0] < _PART * seconds and not (past[1:] and interrupted()):
         slots.budget = Budget.of(None, min(past[-1][2] + 2 ** (len(past) - 1), most))
         if not slots.advance(look=False):
             break  # no seed has an update left

@@ -9,7 +9,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.console.streams import heartbeat
-from mjx_reinforce.runs.design import Design, check_design
+from mjx_reinforce.runs.design import Design, check_design, configure
 from mjx_reinforce.runs.directory import own_directory
 from mjx_reinforce.training.resume import read_record
 
@@ -64,7 +64,8 @@ def perform(
         if files:
             directory = held.enter_context(own_directory(base, design.resume, interrupt))
         # A module of the user's is imported before JAX starts, which it may set up.
-        env = None if envs.is_ours(base.env) else envs.make_set(base.env, base.env_set)
+        first = configure(base, design.configurations())[0]
+        env = None if envs.is_ours(first.env) else envs.make_set(first.env, first.env_set)
         configure_jax()
         from mjx_reinforce.runs.conduct import Conductor
         from mjx_reinforce.runs.display import Display

@@ -231,6 +231,11 @@ def sweep(
       ([{'discount': 0.98}, {'discount': 0.99}], [0, 0, 1, 1])
     """
     check_kind("base", base, Config, 'mjx_reinforce.of_task("Hopper-v5")')
+    if base.resume is not None:
+        raise ValueError(
+            f"sweep() begins a sweep: go on with {base.resume} by python -m mjx_reinforce.sweep "
+            f"--resume {base.resume}"
+        )
     check_swept(over)
     with contextlib.ExitStack() as held:
         asked = base.output if output is None else Path(output)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.runs.command_line import parse_sweep, train_to_the_end
+from mjx_reinforce.runs.directory import locked
 from mjx_reinforce.settings.config import code_flags
 
 if TYPE_CHECKING:
@@ -43,7 +44,8 @@ def report_on(outcome: "Outcome", *, report: bool = True) -> None:
         display.say(f"{took}. Files in {directory}")
         return
     display.say("writing the report")
-    written = _report(directory)
+    with locked(directory):
+        written = _report(directory)
     took += f", statistics and report {written.seconds:.1f} s"
     for sentence in (*written.answer, f"{took}. Files in {directory}, first report.html"):
         display.say(sentence.translate(_PLAIN_QUOTES))

@@ -124,14 +124,16 @@ class SweepFiles(Files[Training]):
         return self._parts / f"{chunk}.npz"
 
     def _write_part(self, driver: Training) -> None:
-        """Writes what the runs of a chunk measured, and their last policies."""
+        """Writes what a chunk measured, and the last policies of each configuration's ends."""
         record = driver.record
         assert isinstance(record, ChunkRecord)
         runs, actors = record.runs, arrays_of(driver.slots.states().train_states.actor)
         found = record.curves() | runs._asdict() | {"nonfinite": record.nonfinite}
         curves = {name: found[name].astype(kind) for name, kind in _CURVES.items()}
-        policies = {f"actor/{name}": np.asarray(x) for name, x in actors.items()}
-        write_arrays(self._path(runs.name), curves | policies)
+        configurations = np.unique(curves["configuration"])
+        kept = np.concatenate([_ends(curves, number) for number in configurations])
+        policies = {f"actor/{name}": np.asarray(x)[kept] for name, x in actors.items()}
+        write_arrays(self._path(runs.name), curves | policies | {"kept": kept})
 
     def _write_policies(
         self, part: Part, chunks: Sequence[Arrays], configs: Sequence[Config]
@@ -145,25 +147,33 @@ class SweepFiles(Files[Training]):
           chunks: what its parts have.
           configs: the settings of all configurations.
         """
-        names = ("configuration", "seed", *(name for name in chunks[0] if "/" in name))
+        names = [name for name in chunks[0] if "/" in name]
         every = {name: np.concatenate([chunk[name] for chunk in chunks]) for name in names}
-        final = np.concatenate([chunk["eval_return"][-1] for chunk in chunks]).astype(np.float64)
+        for name in ("configuration", "seed", "eval_return"):
+            ends = [chunk[name][..., chunk["kept"]] for chunk in chunks]
+            every[name] = np.concatenate([x[-1:] if x.ndim > 1 else x for x in ends], axis=-1)
         for number in part.group.members.tolist():
-            runs = np.flatnonzero(every["configuration"] == number)
-            runs = runs[np.argsort(every["seed"][runs])]
-            values = np.nan_to_num(final[runs], nan=-np.inf)
-            kept = runs[sorted({int(values.argmin()), int(values.argmax())})]
-            actors = {n.removeprefix("actor/"): x[kept] for n, x in every.items() if "/" in n}
+            kept = _ends(every, number)
+            actors = {name.removeprefix("actor/"): every[name][kept] for name in names}
             place, config = self._directory / "policies" / f"{number:03d}", configs[number]
             policy = part.ready.policy
             traced = {k: getattr(config, k) for k in part.group.settings if k in policy}
             save_policy(place / "policy", actor_of(actors), policy | traced)
-            ranked = {"status": "finished", "final_returns": final[kept].tolist()}
+            final = every["eval_return"][-1, kept].astype(np.float64)
+            ranked = {"status": "finished", "final_returns": final.tolist()}
             write_json(place / "summary.json", ranked)
             run = {"env": config.env, "horizon": part.ready.horizon}
             if config.env_set:
                 run["env_set"] = list(config.env_set)
             write_json(place / "config.json", run | {"seeds": every["seed"][kept].tolist()})
+
+
+def _ends(curves: Arrays, number: int) -> np.ndarray:
+    """Returns which runs are the worst and the best seed of a configuration, or which is both."""
+    runs = np.flatnonzero(curves["configuration"] == number)
+    runs = runs[np.argsort(curves["seed"][runs])]
+    values = np.nan_to_num(curves["eval_return"][-1, runs], nan=-np.inf)
+    return runs[sorted({int(values.argmin()), int(values.argmax())})]
 
 
 def join_parts(parts: Sequence[Mapping[str, np.ndarray]]) -> Arrays:

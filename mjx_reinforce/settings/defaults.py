@@ -18,6 +18,8 @@ from mjx_reinforce.settings.config import CODE, Config, spoken
 
 #: Where a budget is large, it has about so many evaluations.
 _EVALUATIONS = 50
+#: More env steps of a seed than a minute gives the small tasks, whose default run is shorter.
+_PLENTY = 60_000_000
 #: In a long run it has so many a minute, of as many seeds as a default run has.
 _A_MINUTE = 3
 
@@ -49,10 +51,15 @@ def of_task(
     """
     few = dataclasses.replace(Config(env=env, num_seeds=num_seeds), **tables.OF_TASKS.get(env, {}))
     config = few
-    minute = tables.MINUTES[env][has_gpu()] if env in tables.MINUTES else 0
-    if env_steps is None and minutes is None and not minute:
+    known = tables.MINUTES.get(env)
+    if env_steps is None and minutes is None and not known:
         return few
-    budget = env_steps or max(1, round((minutes or 1) * (minute or few.env_steps or 0)))
+    minute = _PLENTY if env in tables.TASKS else few.env_steps or 0
+    if known:  # two cores share their time among the seeds, where more is to be had
+        shared = known[0] * Config.num_seeds // min(max(num_seeds, 1), Config.num_seeds)
+        minute = known[1] if has_gpu() else min(shared, max(known))
+    time = round(minute * (1 if minutes is None else minutes))
+    budget = max(1, time) if env_steps is None else env_steps
     for least, settings in tables.OF_BUDGETS.get(env, ()):
         # On a GPU few episodes take as long as many.
         if budget >= least or (env_steps is None and has_gpu()):
@@ -64,7 +71,7 @@ def of_task(
         return config
     # In a run so long that an interrupt, which waits for the updates between two evaluations, would
     # wait long, there are a few a minute.
-    every = min(budget // _EVALUATIONS, minute // _A_MINUTE or budget)
+    every = min(budget // _EVALUATIONS, minute // _A_MINUTE)
     every //= config.episodes_per_update * config.training_horizon(tables.TASKS[env].horizon)
     return dataclasses.replace(config, eval_every=max(config.eval_every, every))
 

@@ -46,9 +46,7 @@ def build(
     Raises:
       ValueError: the settings do not fit the environment.
     """
-    from mjx_reinforce.console.streams import to_screen
     from mjx_reinforce.engine.contract import check_environment
-    from mjx_reinforce.engine.play import available
     from mjx_reinforce.export.policy_files import build_policy
     from mjx_reinforce.learning.contract import check_horizon
 
@@ -65,11 +63,8 @@ def build(
     if is_own(config.algorithm):
         return _build_own(env, config, shared), horizon
     algorithm = find_algorithm(config.algorithm)
-    follows = not algorithm.search_episodes
-    if follows and config.engine != "vmap" and (said := available.announcement(env)):
-        to_screen(said)
     learner = load_definition(algorithm.make)(env, config, **shared)
-    if follows:
+    if not algorithm.search_episodes:
         learner = _for_many_seeds(learner, config, shared["horizon"], devices)
     return learner, horizon
 

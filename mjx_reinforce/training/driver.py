@@ -110,6 +110,15 @@ def drive(
         blocks = max(1, min(int(enough), 2 * len(measured), most))
 
 
+def check_layout(found: Checkpoint, slots: Slots) -> None:
+    """Raises ValueError for a checkpoint of another program."""
+    if found.layout != slots.layout.layout:
+        raise ValueError(
+            "the states in the checkpoint do not fit this version of the program; resume with "
+            "the version that wrote it"
+        )
+
+
 class Training:
     """Runs as they go on, such as a part of a sweep's.
 
@@ -130,11 +139,7 @@ class Training:
 
     def restore(self, found: Checkpoint) -> None:
         """Goes back to a checkpoint, or raises ValueError if it is another program's."""
-        if found.layout != self.slots.layout.layout:
-            raise ValueError(
-                "the states in the checkpoint do not fit this version of the program; resume with "
-                "the version that wrote it"
-            )
+        check_layout(found, self.slots)
         self.slots.restore(found.states)
         self.record.restore(found.record)
         self._began = time.perf_counter() - found.seconds

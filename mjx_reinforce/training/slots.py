@@ -313,7 +313,7 @@ def compile_slots(
       meanwhile: begins other work in Python; called once the rest of the time is XLA's.
 
     Raises:
-      ValueError: even the narrowest slot does not fit into memory.
+      ValueError: the widest slot does not fit into memory.
     """
     layout = StateRows(programs.like)
     begin = started(functools.partial(_compile_begin, programs, widths[0]))
@@ -322,12 +322,7 @@ def compile_slots(
     for width in widths[1:]:
         slots[width] = started(lambda width=width: _trace_slot(programs, layout, width)())
     meanwhile()
-    try:
-        widest.result()
-    except ValueError:  # it may not fit into memory
-        if len(widths) == 1:
-            raise
-        return compile_slots(programs, config, widths[1:], clock)
+    widest.result()
     return Compiled(begin.result(), slots, programs, config, clock or Stopwatch())
 
 

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from mjx_reinforce.console.streams import heartbeat, to_screen
+from mjx_reinforce.console.streams import heartbeat
 
 
 def test_it_says_what_goes_on():
@@ -37,14 +37,3 @@ def test_nothing_is_said_of_what_is_quick():
     with heartbeat(said.append, interval=60.0):
         pass
     assert said == []
-
-
-def test_a_line_that_the_screen_does_not_take_is_lost(monkeypatch, capsys):
-    to_screen("shown")
-    assert capsys.readouterr().out == "shown\n"
-
-    def full(*_, **__):
-        raise OSError("no space")
-
-    monkeypatch.setattr("builtins.print", full)
-    to_screen("lost")

@@ -71,7 +71,13 @@ def test_a_default_run_has_the_budget_of_its_machine(monkeypatch, gpu):
         assert parse(["--env", env]).base == config
         if gpu and env in tables.OF_BUDGETS:
             assert config.num_episodes >= 128
-        assert of_task(env, minutes=2.0).env_steps == 2 * config.env_steps
+        longer = of_task(env, minutes=2.0)
+        assert longer.env_steps == 2 * config.env_steps or env not in tables.MINUTES
+        played = longer.episodes_per_update * longer.eval_every * tables.TASKS[env].horizon
+        assert longer.env_steps < 60 * played
+    alone = of_task("Walker2d-v5", num_seeds=1)  # two cores play more of one seed
+    assert (alone.env_steps == 4 * 3_900_000) != gpu
+    assert alone.update == "natural-gradient"
 
 
 def test_a_budget_chooses_the_settings():

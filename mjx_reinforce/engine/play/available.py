@@ -1,4 +1,4 @@
-"""Whether machine code can play here, what its numbers depend on, and how long it takes to make.
+"""Whether machine code can play here, what its numbers depend on, and whether it takes too long.
 
 The time is found before anything is written. It goes with the number of scalar operations, and
 with the square of the entries of an observation, all of which LLVM holds at once. On two quiet
@@ -14,11 +14,10 @@ from typing import Any
 
 import jax
 
-from mjx_reinforce.engine.base import Environment, null_action
+from mjx_reinforce.engine.base import Environment
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.gpu import seam as gpu
 from mjx_reinforce.engine.scalar import TooLarge, jaxprs, size
-from mjx_reinforce.engine.team import program as team
 
 #: LLVM 20, which llvmlite 0.45 has, is the first that reads the IR as it is written here.
 _OLDEST = (20,)
@@ -31,8 +30,6 @@ _SETTINGS = (
 )
 #: Nobody waits longer for what ``jax.vmap`` compiles in less.
 MAX_SECONDS = 80
-#: People are told beforehand of what takes longer.
-_WORTH_SAYING = 15
 _PER_SCALAR, _PER_PAIR_OF_ENTRIES = 2e-5, 2.7e-5
 
 
@@ -127,26 +124,5 @@ def check_seconds(env: Environment, traced: jaxprs.Program, entries: int) -> Non
         )
 
 
-def seconds(env: Environment) -> float:
-    """Returns about how long writing and compiling an environment's step takes (s)."""
-    start = jax.eval_shape(env.reset, jax.random.key(0))
-    traced, _ = jaxprs.trace(env.step, start, null_action(env))
-    return _seconds(traced, start.obs.shape[0])
-
-
 def _seconds(traced: jaxprs.Program, entries: int) -> float:
     return _PER_SCALAR * size.num_scalars(traced) + _PER_PAIR_OF_ENTRIES * entries**2
-
-
-def announcement(env: Environment) -> str | None:
-    """Returns what people must know who wait for machine code; None where nobody waits long."""
-    if unavailable() or (platform() == "gpu" and team.why_not(env) is None):
-        return None
-    expected, contacts = seconds(env), getattr(env, "num_contacts", 0)
-    if not _WORTH_SAYING < expected <= MAX_SECONDS:
-        return None
-    cause = f", with up to {contacts} contacts," if contacts else ""
-    return (
-        f"writing the simulation out{cause} and compiling it takes about {expected:.0f} s, or much "
-        "less if this was compiled before"
-    )

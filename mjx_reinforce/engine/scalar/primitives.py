@@ -192,7 +192,7 @@ _WHOLE.def_abstract_eval(
 
 
 def whole(
-    name: str, results: Mapping[str, Any], *args: jax.Array, owner: Any = None
+    name: str, results: Mapping[str, Any], *args: jax.Array, owner: str = ""
 ) -> dict[str, jax.Array]:
     """Calls an operation that a backend knows by its name, where ``is_kept_whole``.
 
@@ -200,17 +200,17 @@ def whole(
       name: of the operation.
       results: of its results by name, their shapes and dtypes.
       *args: its operands.
-      owner: whose operation it is, if it is not everybody's.
+      owner: whose operation it is, as ``hex(id(env))``; "" if it is everybody's.
     """
     facts = tuple((field, x.shape, np.dtype(x.dtype)) for field, x in results.items())
     made = _WHOLE.bind(*args, name=name, results=facts, owner=owner)
     return dict(zip(results, made, strict=True))
 
 
-def owners(traced: jaxprs.Program) -> Iterator[Any]:
+def owners(traced: jaxprs.Program) -> Iterator[str]:
     """Yields, once a call, whose operations a program calls by their names."""
     for eqn in traced.jaxpr.eqns:
-        if eqn.primitive is _WHOLE and eqn.params["owner"] is not None:
+        if eqn.primitive is _WHOLE and eqn.params["owner"]:
             yield eqn.params["owner"]
         yield from itertools.chain(*map(owners, jaxprs.subprograms(eqn.params.values())))
 

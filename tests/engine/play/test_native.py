@@ -234,14 +234,11 @@ def test_auto_falls_back_whatever_the_writer_raises(monkeypatch):
 
 @pytest.mark.cpu
 def test_large_models_are_not_for_machine_code(monkeypatch):
-    """The reason says which bodies meet most, and people who wait are told of it beforehand."""
+    """The reason says which bodies meet most."""
     env = Drifting()
     env.mj_model = mujoco.MjModel.from_xml_string(SCENE)  # pyright: ignore
-    env.num_contacts = 14
     monkeypatch.setattr(objects, "folder", lambda: None)
     monkeypatch.setattr(machine, "_LOADED", {})
-    monkeypatch.setattr(available, "_WORTH_SAYING", 0)
-    assert "with up to 14 contacts, and compiling" in str(available.announcement(env))
     monkeypatch.setattr(available, "MAX_SECONDS", 1e-9)
     engine = chosen(env)
     assert engine.name == "vmap"
