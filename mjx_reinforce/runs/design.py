@@ -119,6 +119,13 @@ def check_design(design: Design) -> None:
     check_each(design.base)
     if design.over:
         _check_sweep(design)
+    runs = design.count() * design.base.num_seeds
+    if runs * _RESULT > host_memory():
+        raise ValueError(
+            f"the results of {runs:,} runs do not fit into memory: they need about "
+            f"{gigabytes(runs * _RESULT)}, {gigabytes(host_memory())} are here; lower --num-seeds "
+            "or the number of values after --over"
+        )
     configure(design.base, design.configurations(), design.given)
     check_installed(design.base)
 
@@ -131,13 +138,6 @@ def _check_sweep(design: Design) -> None:
     if design.chunk_runs is not None and design.chunk_runs < 1:
         raise ValueError(f"--chunk-runs must be at least 1, got {design.chunk_runs}")
     check_over(design.base, design.over)
-    runs = design.count() * design.base.num_seeds
-    if runs * _RESULT > host_memory():
-        raise ValueError(
-            f"the results of {runs:,} runs do not fit into memory: they need about "
-            f"{gigabytes(runs * _RESULT)}, {gigabytes(host_memory())} are here; lower --num-seeds "
-            "or the number of values after --over"
-        )
 
 
 _FIELDS = {field.name: field for field in dataclasses.fields(Config)}
