@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.reports.curves import on_grid
 from mjx_reinforce.reports.experiment import Configuration, Experiment
 from mjx_reinforce.statistics import Estimate, iqm, iqm_interval
 from mjx_reinforce.statistics.aggregates import interval, wilson
@@ -178,6 +177,18 @@ def compute_findings(experiment: Experiment) -> Findings:
         few=_ask_few(ranked),
         learning=compare_learning(ranked, min(ends)),
     )
+
+
+def on_grid(grid: np.ndarray, steps: np.ndarray, returns: np.ndarray) -> np.ndarray:
+    """Returns curves [E, S] read off, by linear interpolation, on a grid [K] of steps: [K, S].
+
+    A return that is not finite makes all that is read off beside it so, too.
+    """
+    curves = []
+    for s in range(returns.shape[1]):
+        moved = np.diff(steps[:, s], prepend=-1) > 0  # a seed that stands still keeps its value
+        curves.append(np.interp(grid, steps[moved, s], returns[moved, s]))
+    return np.stack(curves, axis=1)
 
 
 def _curve_steps(parts: Sequence[Configuration], end: int) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
@@ -11,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.learning import counts
-from mjx_reinforce.reports.curves import load_libraries
 from mjx_reinforce.reports.experiment import counted, say, setting_in_words
 from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.plan import Part, Prepared
@@ -114,10 +112,8 @@ class Conductor(Observer[Training]):
 
     def _compile(self, part: Part) -> Compiled:
         """Returns the programs of a group."""
-        drawing = threading.Thread(target=load_libraries, daemon=True)
-        meanwhile = drawing.start if self._prepared.alone else lambda: None
         programs, config = part.ready.programs(), part.group.config
-        return compile_slots(programs, config, part.widths, self._clock, meanwhile)
+        return compile_slots(programs, config, part.widths, self._clock)
 
     def _chunks(self) -> Iterator[tuple[Part, Runs, Compiled]]:
         """Yields the chunks that are left, with the programs of their group."""

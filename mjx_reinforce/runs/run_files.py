@@ -10,7 +10,7 @@ from typing import Any
 from mjx_reinforce import files
 from mjx_reinforce.export.policy_files import save_policy
 from mjx_reinforce.files import write_arrays, write_bytes
-from mjx_reinforce.reports.curves import draw_learning_curve
+from mjx_reinforce.reports.charts import curves
 from mjx_reinforce.runs.plan import Prepared
 from mjx_reinforce.runs.saving import Files
 from mjx_reinforce.runs.sinks import Sink, open_sinks
@@ -100,9 +100,10 @@ class RunFiles(Files[Driver]):
         """Writes the last files, summary.json last of all, or raises OSError."""
         self._save_policies(driver)
         self._write_rows()
-        training = driver.record.training()
-        write_arrays(self._directory / "returns.npz", training, compressed=True)
-        write_bytes(self._directory / "learning_curve.png", draw(driver))
+        write_arrays(self._directory / "returns.npz", driver.record.training(), compressed=True)
+        record = driver.record
+        picture = curves.picture(driver.config.env, record.threshold, record.history())
+        write_bytes(self._directory / "learning_curve.png", picture)
         self._write_json("summary.json", summary)
         for sink in self._sinks:
             self._attempt(sink.name, sink.close)
@@ -136,14 +137,6 @@ class RunFiles(Files[Driver]):
         """Appends to metrics.csv the rows that it lacks."""
         files.append(self._metrics, self._waiting)
         self._waiting = b""
-
-
-def draw(driver: Driver) -> bytes:
-    """Returns the contents of learning_curve.png."""
-    config, record = driver.config, driver.record
-    axis = "episodes" if config.env_steps is None else "env_steps"
-    history, training = record.history(), record.training()
-    return draw_learning_curve(history, training, config.env, record.threshold, axis)
 
 
 class Callbacks(Observer[Driver]):

@@ -195,24 +195,3 @@ def summarize(history: dict[str, np.ndarray], threshold: float | None) -> dict[s
         "env_steps_to_solve": steps_to_solve(returns, history["env_steps"], threshold),
         "episodes_to_solve": steps_to_solve(returns, history["episodes"], threshold),
     }
-
-
-def smooth(values: np.ndarray, window: int) -> np.ndarray:
-    """Returns the mean of each value [U, ...] and up to ``window`` - 1 before it.
-
-    It is NaN where one of these is not finite, and only there.
-    """
-    finite = np.isfinite(values)
-    last = np.arange(len(values)) + 1
-    first = np.maximum(last - window, 0)
-    count = (last - first).reshape(-1, *(1,) * (values.ndim - 1))
-    sums = _sums_before(np.where(finite, values, 0))
-    known = _sums_before(finite)
-    mean = (sums[last] - sums[first]) / count
-    return np.where(known[last] - known[first] == count, mean, np.nan)
-
-
-def _sums_before(values: np.ndarray) -> np.ndarray:
-    """Returns the sums of the first 0, 1, ..., U values [U, ...]."""
-    sums = np.cumsum(values, axis=0)
-    return np.concatenate([np.zeros_like(sums[:1]), sums])

@@ -298,7 +298,6 @@ def compile_slots(
     config: Config,
     widths: Sequence[int],
     clock: Stopwatch | None = None,
-    meanwhile: Callable[[], object] = lambda: None,
 ) -> Compiled:
     """Compiles programs for the widest slot, and begins with the narrower ones.
 
@@ -310,7 +309,6 @@ def compile_slots(
       widths: how many runs a slot may have, the most first; multiples of the devices that have
         runs of their own.
       clock: see ``Compiled``.
-      meanwhile: begins other work in Python; called once the rest of the time is XLA's.
 
     Raises:
       ValueError: the widest slot does not fit into memory.
@@ -321,23 +319,19 @@ def compile_slots(
     slots = {widths[0]: widest}
     for width in widths[1:]:
         slots[width] = started(lambda width=width: _trace_slot(programs, layout, width)())
-    meanwhile()
     widest.result()
     return Compiled(begin.result(), slots, programs, config, clock or Stopwatch())
 
 
-def compile_run(
-    programs: Programs, config: Config, meanwhile: Callable[[], object] = lambda: None
-) -> Slots:
+def compile_run(programs: Programs, config: Config) -> Slots:
     """Returns the seeds of a run before the first update, in one slot.
 
     Args:
       programs: of the run.
       config: its settings.
-      meanwhile: see ``compile_slots``.
     """
     widths = [programs.division.lanes(config.num_seeds)]
-    compiled = compile_slots(programs, config, widths, meanwhile=meanwhile)
+    compiled = compile_slots(programs, config, widths)
     return Slots(compiled, config.first_seed + np.arange(config.num_seeds))
 
 

@@ -18,7 +18,6 @@ from mjx_reinforce import load, load_policy
 from mjx_reinforce.files import append, csv_text
 from mjx_reinforce.learning import normalize
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.statistics import smooth
 from mjx_reinforce.store.build import build
 
 ARGUMENTS = ["--env", "Survive-v0", "--num-seeds", "3", "--env-steps", "1500"]
@@ -208,14 +207,6 @@ def test_a_full_disk_leaves_no_half_row(tmp_path):
     assert path.read_bytes() == b"a\n1\n"
     append(path, b"23456\n")
     assert path.read_bytes() == b"a\n1\n23456\n"
-
-
-def test_smoothing_is_a_mean_of_the_latest():
-    values = np.arange(12.0).reshape(6, 2)
-    values[1, 0] = np.nan
-    expected = [values[max(0, u - 2) : u + 1].mean(axis=0) for u in range(6)]
-    np.testing.assert_allclose(smooth(values, 3), expected)
-    assert np.isnan(expected).sum() == 3
 
 
 class Broken(Survive):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjx_reinforce import envs
-from mjx_reinforce.runs import conduct, run_files
+from mjx_reinforce.runs import conduct
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store.ready import made
 from mjx_reinforce.training.slots import compile_run
@@ -58,17 +58,6 @@ def test_a_summary_says_how_the_run_ended(driver, monkeypatch):
     monkeypatch.setattr(driver.record, "hopeless", lambda: True)
     stopped = conduct.summary_of(driver, "vmap", 3.0, {"final_test_returns": []})
     assert (stopped["status"], stopped["reason"]) == ("stopped", conduct.HOPELESS)
-
-
-def test_a_curve_is_drawn_over_the_budget_that_the_run_has(driver, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(run_files, "draw_learning_curve", lambda *args: drawn.append(args))
-    run_files.draw(driver)
-    driver.config = dataclasses.replace(driver.config, env_steps=100)
-    run_files.draw(driver)
-    assert [args[-1] for args in drawn] == ["episodes", "env_steps"]
-    assert drawn[0][0]["eval_return"].shape == (3, 2)
-    assert drawn[0][2] == CONFIG.env
 
 
 def test_minutes_become_env_steps_before_the_run_begins(ready, monkeypatch):

@@ -6,10 +6,9 @@ import warnings
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from scipy import stats
 
-from mjx_reinforce.reports import curves
+from mjx_reinforce.reports import findings
 from mjx_reinforce.statistics import (
     bootstrap,
     iqm,
@@ -183,7 +182,6 @@ def test_a_curve_counts_failed_seeds_and_holds_those_that_stand_still():
     """The mean of three seeds: one fails in its second evaluation, one stops after it."""
     steps = np.array([[0, 0, 0], [10, 10, 10], [20, 20, 10], [30, 20, 10]])
     returns = np.array([[0.0, 3, 6], [6, np.nan, 6], [12, 9, np.nan], [18, np.nan, np.nan]])
-    axes = Figure().subplots()
     grid = np.array([0.0, 5, 10, 15, 20, 30])
-    curves._draw_mean(axes, grid, steps, returns, "blue", "")
-    np.testing.assert_allclose(axes.lines[0].get_ydata(), [3, np.nan, np.nan, np.nan, 9, 11])
+    curves = findings.on_grid(grid, steps, returns)
+    np.testing.assert_allclose(iqm(curves), [3, np.nan, np.nan, np.nan, 9, 11])

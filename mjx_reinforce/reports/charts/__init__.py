@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mjx_reinforce.reports.curves import drawn_threshold
 from mjx_reinforce.reports.findings import Findings, Result
 from mjx_reinforce.statistics import Estimate
 
@@ -264,8 +263,13 @@ def moment_line(findings: Findings) -> Spec:
 
 def threshold_of(findings: Findings) -> float | None:
     """Returns the return that counts as solved, None where it would squeeze all that is drawn."""
+    threshold = findings.experiment.threshold
     returns = [each.configuration.eval_return.ravel() for each in findings.results]
-    return drawn_threshold(findings.experiment.threshold, np.concatenate(returns))
+    known = np.concatenate(returns)
+    known = known[np.isfinite(known)]
+    if threshold is None or not known.size or threshold - known.max() > 0.5 * np.ptp(known):
+        return None
+    return threshold
 
 
 def threshold_line(findings: Findings, axis: str) -> list[Spec]:

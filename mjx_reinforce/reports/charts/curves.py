@@ -7,7 +7,8 @@ import numpy as np
 
 from mjx_reinforce.reports import charts
 from mjx_reinforce.reports.charts import Table, short, stacked
-from mjx_reinforce.reports.findings import Findings, Result, from_the_worst
+from mjx_reinforce.reports.experiment import Configuration, Experiment
+from mjx_reinforce.reports.findings import Findings, Result, compute_findings, from_the_worst
 from mjx_reinforce.reports.words import number
 
 #: Seeds that are drawn one by one: of one configuration, and of all together.
@@ -44,6 +45,23 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         data={"curves": _bands(findings), "seeds": _seeds(findings)},
         listed="curves",
     )
+
+
+def picture(env: str, threshold: float | None, history: dict[str, np.ndarray]) -> bytes:
+    """Returns the chart of a run's seeds as a PNG file.
+
+    Args:
+      env: its id.
+      threshold: the return that counts as solved, if any.
+      history: ``eval_return`` and ``env_steps`` [E, S] of its evaluations.
+    """
+    seeds = np.arange(history["eval_return"].shape[1])
+    shown = Configuration(
+        env, {}, history["eval_return"], history["env_steps"], np.zeros_like(seeds), seeds
+    )
+    experiment = Experiment(env, env, threshold, [shown], {}, {}, {}, [], [], [])
+    (chart,) = draw(compute_findings(experiment))
+    return charts.render_chart(chart, [env], env)["png"]
 
 
 def _return(field: str) -> charts.Spec:
