@@ -14,7 +14,7 @@ from flax import struct
 from mujoco import mjMAXVAL, mjx  # pyright: ignore[reportAttributeAccessIssue] (a C extension)
 
 from mjx_reinforce.engine.base import Box, MjModel, is_kept_whole, observation_size
-from mjx_reinforce.engine.checks import changed_fields, check_count, check_name, check_number
+from mjx_reinforce.engine.checks import changed_fields, check_count, check_number
 from mjx_reinforce.engine.contract import check_shape
 from mjx_reinforce.engine.physics import mjx_internals
 from mjx_reinforce.engine.physics import step as physics
@@ -24,8 +24,6 @@ from mjx_reinforce.envs import models
 from mjx_reinforce.envs.outcomes import check_episode, check_outcome, check_start
 from mjx_reinforce.envs.parts import Named, View
 from mjx_reinforce.envs.settings import EpisodeSettings, build_settings
-
-SOLVERS = ("exact", "mjx", "fast")
 
 
 @struct.dataclass(kw_only=True)
@@ -65,6 +63,15 @@ class Before(Named, Simulation):
         )
 
 
+#: A forward pass of C MuJoCo 4.0.
+_forward = mjx_internals.fenced(physics.forward)
+
+
+def _step_of(model: mjx.Model, forward: Callable[..., Any]) -> Callable[..., Any]:
+    """Returns a physics step of a model, of which ``forward`` is the forward pass."""
+    return functools.partial(physics.step, model, evaluate=forward)
+
+
 def _carried(state: "Physics | mjx.Data") -> dict[str, jax.Array]:
     """Returns what MuJoCo carries from step to step, of a state or a simulation."""
     return {name: getattr(state, name) for name in models.CARRIED}
@@ -99,19 +106,10 @@ class MujocoEnv(Env):
         ``mujoco.MjSpec`` or ``mujoco.MjModel``, which is copied."""
         frame_skip: int
         """Physics steps an env step; the model says how many seconds a physics step lasts."""
-        solver: str = "exact"
-        """What simulates the model, at the start of an episode and in each step.
-
-        "exact": ``physics.forward`` and ``physics.step``, which give the answer of C MuJoCo 4.0.
-        "mjx": ``mjx.forward`` and ``mjx.step`` as they are.
-        "fast": the same two with one solver iteration of at most four line-search steps. This is
-        not exact.
-        """
 
         def __post_init__(self):
             """Raises ValueError for a value that is out of its range."""
             super().__post_init__()
-            check_name("solver", self.solver, dict.fromkeys(SOLVERS))
             check_count("frame_skip", self.frame_skip)
 
     settings: Settings
@@ -136,15 +134,10 @@ class MujocoEnv(Env):
         self.max_episode_steps = self.settings.max_episode_steps
         self.reward_threshold = self.settings.reward_threshold
         self.mj_model = models.load_model(self.settings.xml_file)
-        if self.settings.solver == "fast":
-            self.mj_model.opt.iterations, self.mj_model.opt.ls_iterations = 1, 4
         self.model = models.to_mjx(self.mj_model, self.settings.xml_file)
         # Tracing the physics takes a second of Python; jit does it once.
-        forward = physics.forward if self.settings.solver == "exact" else mjx.forward
-        forward = mjx_internals.fenced(forward)
-        self._evaluate = forward
-        self._forward = jax.jit(functools.partial(forward, self.model))
-        self._physics_step = jax.jit(self._step_of(self.model, self._forward))
+        self._forward = jax.jit(functools.partial(_forward, self.model))
+        self._physics_step = jax.jit(_step_of(self.model, self._forward))
         self._start = jax.jit(prune(self._forward_state))
         low, high = np.array(self.mj_model.actuator_ctrlrange).T
         limited = np.array(self.mj_model.actuator_ctrllimited, bool)
@@ -214,20 +207,14 @@ class MujocoEnv(Env):
         start = self._forward_state if is_kept_whole() else self._start
         return start(qpos, qvel, episode or {})
 
-    def _step_of(self, model: mjx.Model, forward: Callable[..., Any]) -> Any:
-        """Returns a physics step of a model, of which ``forward`` is the forward pass."""
-        if self.settings.solver == "exact":
-            return functools.partial(physics.step, model, evaluate=forward)
-        return functools.partial(mjx.step, model)
-
     def _physics_of(self, episode: dict[str, jax.Array]) -> tuple[Any, Any]:
         """Returns the forward pass and the step of the model as it is in an episode."""
         fields = models.replaced(episode)
         if not fields:
             return self._forward, self._physics_step
         model = self.model.replace(**fields)
-        forward = functools.partial(self._evaluate, model)
-        return forward, self._step_of(model, forward)
+        forward = functools.partial(_forward, model)
+        return forward, _step_of(model, forward)
 
     def _forward_state(
         self, qpos: jax.Array, qvel: jax.Array, episode: dict[str, jax.Array]
@@ -284,7 +271,7 @@ class MujocoEnv(Env):
 
     def _stays_whole(self, episode: dict[str, jax.Array]) -> bool:
         """Returns whether the physics is to stay one operation, which device code computes."""
-        return is_kept_whole() and self.settings.solver == "exact" and not models.replaced(episode)
+        return is_kept_whole() and not models.replaced(episode)
 
     def _whole(self, name: str, start: mjx.Data) -> tuple[mjx.Data, jax.Array]:
         """Returns what an operation of the device code makes of a simulation; whether it is sound.

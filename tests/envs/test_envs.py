@@ -13,12 +13,10 @@ import pytest
 from brax.envs import wrappers
 from command_lines import run_command
 from gymnasium.envs.registration import load_env_creator
-from mujoco import mjx
 
 from mjx_reinforce import Environment, envs, watch
 from mjx_reinforce.engine.base import Discrete, action_space, null_action, observation_size
 from mjx_reinforce.engine.checks import BadEnvironmentError
-from mjx_reinforce.engine.physics.mjx_internals import fenced
 from mjx_reinforce.engine.play import objects
 from mjx_reinforce.envs.outcomes import check_outcome, check_start
 from mjx_reinforce.envs.settings import EpisodeSettings, read_settings
@@ -134,7 +132,6 @@ def test_settings_are_frozen_and_gymnasiums(ids):
     [
         ("InvertedPendulm-v5", {}, "Did you mean 'InvertedPendulum-v5'"),
         ("Hopper-v5", {"helthy_reward": 1}, "of Hopper 'helthy_reward'.*'healthy_reward'.*Known"),
-        ("InvertedPendulum-v5", {"solver": "mjxx"}, "unknown solver 'mjxx'"),
         ("CartPole-v1", {"max_episode_steps": 0}, "max_episode_steps must be at least 1, got 0"),
         ("CartPole-v1", {"kinematics_integrator": "rk4"}, "unknown integrator 'rk4'"),
         ("Swimmer-v5", {"reset_noise_scale": -0.1}, "reset_noise_scale must be 0 or more"),
@@ -148,35 +145,6 @@ def test_settings_are_frozen_and_gymnasiums(ids):
 def test_wrong_arguments_are_explained(id, wrong, message):
     with pytest.raises(ValueError, match=message):
         envs.make(id, **wrong)
-
-
-#: A tilted capsule, partly in the floor, where the contact frames of C MuJoCo and MJX differ.
-CAPSULE = """
-<mujoco>
-  <worldbody>
-    <geom type="plane" size="1 1 1"/>
-    <body pos="0 0 .3">
-      <joint name="lift" type="slide" axis="0 0 1"/>
-      <joint axis="1 2 0" type="hinge"/>
-      <geom type="capsule" size=".1 .2"/>
-    </body>
-  </worldbody>
-  <actuator><motor joint="lift"/></actuator>
-</mujoco>
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("solver", "is_mjx"), [("mjx", True), ("fast", True), ("exact", False)])
-def test_the_start_is_of_the_solver(tmp_path, solver, is_mjx):
-    """It is ``mjx.forward``, operation for operation, unless C MuJoCo's contacts are asked for."""
-    path = tmp_path / "capsule.xml"
-    path.write_text(CAPSULE, encoding="utf-8")
-    env = envs.make("InvertedPendulum-v5", xml_file=str(path), solver=solver)
-    theirs = jax.jit(functools.partial(fenced(mjx.forward), env.model))
-    start = mjx.make_data(env.mj_model, impl="jax")
-    ours, theirs = (str(jax.make_jaxpr(forward)(start)) for forward in (env._forward, theirs))
-    assert (ours == theirs) == is_mjx
 
 
 @pytest.mark.parametrize(

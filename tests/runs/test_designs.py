@@ -90,14 +90,16 @@ def test_every_run_is_in_one_chunk_and_every_chunk_has_its_share(num_chunks):
 
 
 def test_settings_of_the_environment_are_swept_as_words():
-    over = design.read_over([("env-set.frame_skip", "2", "1e1"), ("env-set.solver", "mjx", "fast")])
-    assert over == {"env_set.frame_skip": [2, 10], "env_set.solver": ["mjx", "fast"]}
+    over = design.read_over(
+        [("env-set.frame_skip", "2", "1e1"), ("env-set.xml_file", "a.xml", "b.xml")]
+    )
+    assert over == {"env_set.frame_skip": [2, 10], "env_set.xml_file": ["a.xml", "b.xml"]}
     base = Config(env="Hopper-v5", env_set=("reset_noise_scale=0.1", "frame_skip=4"))
     design.check_over(base, over)
     configs = design.configure(base, design.grid(over))
     kept = "reset_noise_scale=0.1"
-    assert configs[1].env_set == (kept, "frame_skip=2", "solver=fast")
-    assert configs[2].env_set == (kept, "frame_skip=10", "solver=mjx")
+    assert configs[1].env_set == (kept, "frame_skip=2", "xml_file=b.xml")
+    assert configs[2].env_set == (kept, "frame_skip=10", "xml_file=a.xml")
     assert len(make_groups(configs, tuple(over), exact=False)) == 4
 
 
