@@ -15,12 +15,6 @@ from mjx_reinforce.settings.flags import run_command
 if TYPE_CHECKING:
     from mjx_reinforce.engine.base import MjModel
 
-#: Of a robot that stands on its own.
-_WALKING = """\
-        # To walk: forward = (data.qpos[0] - before.qpos[0]) / self.dt is its speed along x (m/s).
-        # To end where it falls: data.qpos[2] < {low:.2g} (m) in place of False.
-"""
-
 
 @dataclasses.dataclass(frozen=True)
 class NewSettings:
@@ -75,10 +69,8 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
     """
     timestep = float(model.opt.timestep)
     frame_skip = max(1, round(0.04 / timestep))
-    free = [i for i in range(model.njnt) if model.jnt_type[i] == 0]
-    pose = "self.mj_model.key_qpos[0]" if model.nkey else "self.mj_model.qpos0"
-    height = float((model.key_qpos[0] if model.nkey else model.qpos0)[2]) if free else 0.0
-    observed = ["data.qpos[2:]" if free == [0] else "data.qpos", "data.qvel"]
+    moves = model.njnt > 0 and model.jnt_type[0] == 0  # a robot that stands on its own
+    observed = ["data.qpos[2:]" if moves else "data.qpos", "data.qvel"]
     template = Path(__file__).with_name("new_task.txt").read_text("utf-8")
     return template.format(
         title=_title(module),
@@ -87,62 +79,29 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
         frame_skip=frame_skip,
         timestep=timestep,
         steps=round(5 / (frame_skip * timestep)) or 1,
-        nq=model.nq,
         nv=model.nv,
-        pose=pose,
-        unit="".join(_unit_quaternions(model)),
-        walking=_WALKING.format(low=height / 2) if free == [0] else "",
+        pose="self.mj_model.key_qpos[0]" if model.nkey else "self.mj_model.qpos0",
         observed=", ".join(observed + ["data.sensordata"] * (model.nsensordata > 0)),
-        about="".join(_about(model)),
+        about="\n".join(_about(model)),
     )
 
 
 def _title(module: str) -> str:
     """Returns the name of the class in a module: my_arm -> MyArm."""
-    title = "".join(word[:1].upper() + word[1:] for word in module.split("_"))
-    return title if title.isidentifier() else f"Robot{title}"
-
-
-def _size(model: "MjModel", joint: int) -> int:
-    """Returns how many entries of qpos a joint has: free, ball, slide or hinge."""
-    return (7, 4, 1, 1)[int(model.jnt_type[joint])]
-
-
-def _unit_quaternions(model: "MjModel") -> Iterator[str]:
-    """Yields a line for each quaternion of qpos, which noise makes longer or shorter."""
-    for joint in range(model.njnt):
-        if (size := _size(model, joint)) > 1:
-            end = int(model.jnt_qposadr[joint]) + size
-            part = f"{end - 4}:{end}"
-            yield f"        qpos = qpos.at[{part}].divide(jnp.linalg.norm(qpos[{part}]))\n"
+    return "".join(word[:1].upper() + word[1:] for word in module.split("_"))
 
 
 def _about(model: "MjModel") -> Iterator[str]:
-    """Yields the lines of the class's docstring: its positions, its actions, and its places."""
-    yield "    Joints:\n"
+    """Yields the lines of the class's docstring: where its joints and actions stand."""
     for i in range(model.njnt):
-        first, size = int(model.jnt_qposadr[i]), _size(model, i)
-        where = f"{first}:{first + size}" if size > 1 else first
-        yield f"      {_safe_name(model.joint(i).name, 'joint', i)} at qpos[{where}]\n"
-    yield "    Actions:\n"
+        yield f"    qpos[{model.jnt_qposadr[i]}]: joint {json.dumps(model.joint(i).name)}"
     for i in range(model.nu):
         low, high = model.actuator_ctrlrange[i]
-        limits = f"in [{low:g}, {high:g}]" if model.actuator_ctrllimited[i] else "unlimited"
-        moved = (
-            model.joint(model.actuator_trnid[i, 0]).name if model.actuator_trntype[i] == 0 else ""
-        )
-        name = _safe_name(model.actuator(i).name or moved, "actuator", i)
-        yield f"      {name}, {limits}\n"
-    yield "    Places (m):\n"
-    for kind, count in (("site", model.nsite), ("body", model.nbody)):
-        for name in (getattr(model, kind)(i).name for i in range(count)):
-            if name not in ("", "world"):
-                yield f"      data.{kind}({json.dumps(name)}).xpos\n"
-
-
-def _safe_name(name: str, kind: str, number: int) -> str:
-    """Returns a name that is safe in a docstring, or what has none."""
-    return re.sub(r'["\\\n]', "_", name) or f"{kind} {number}"
+        limits = f" in [{low:g}, {high:g}]" if model.actuator_ctrllimited[i] else ""
+        of_joint = model.actuator_trntype[i] == 0
+        moved = model.joint(model.actuator_trnid[i, 0]).name if of_joint else ""
+        name = json.dumps(model.actuator(i).name or moved)
+        yield f"    action[{i}]: actuator {name}{limits}"
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from mjx_reinforce.settings.config import (
     read_seeds,
 )
 from mjx_reinforce.settings.defaults import flag_value, for_arguments, named_code
-from mjx_reinforce.settings.flags import about_word, asks_brief_help, read_command_line
+from mjx_reinforce.settings.flags import about_word, asks_brief_help, cannot_load, read_command_line
 from mjx_reinforce.settings.groups import GROUPS, MAIN, UNUSUAL
 from mjx_reinforce.settings.tables import PRESETS
 from mjx_reinforce.training import resume
@@ -255,8 +255,7 @@ def _train(
     except ValueError as error:
         refuse(str(error))
     except (ImportError, MemoryError) as error:
-        remedy = "see pip check, and ulimit -v where memory is short"
-        refuse(f"cannot load what this package needs ({error}); {remedy}")
+        refuse(cannot_load(error))
     except (RuntimeError, OSError) as error:
         _refuse_full(error, design)
     if outcome.summary["status"] != "interrupted" or interrupt.number is None:

@@ -117,6 +117,12 @@ def about_word(word: str) -> str:
     return f"no flag or command takes {word!r}.{hint} (See --help.)"
 
 
+def cannot_load(error: Exception) -> str:
+    """Returns what is said of a library that is broken, or finds no memory."""
+    remedy = "see pip check, and ulimit -v where memory is short"
+    return f"cannot load what this package needs ({error}); {remedy}"
+
+
 def run_command(form: type[Form], name: str, do: Callable[[Form], object]) -> None:
     """Reads the command line of a command, does what it says, and exits if that fails.
 
@@ -132,6 +138,9 @@ def run_command(form: type[Form], name: str, do: Callable[[Form], object]) -> No
         do(read_command_line(form, sys.argv[1:], command(name)))
     except (ValueError, OSError) as error:
         say_error(str(error))
+        sys.exit(2)
+    except (ImportError, MemoryError) as error:
+        say_error(cannot_load(error))
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)

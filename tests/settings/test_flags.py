@@ -7,7 +7,12 @@ from typing import Literal
 
 import pytest
 
-from mjx_reinforce.settings.flags import asks_brief_help, read_command_line, run_command
+from mjx_reinforce.settings.flags import (
+    asks_brief_help,
+    cannot_load,
+    read_command_line,
+    run_command,
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -97,6 +102,7 @@ def test_the_whole_help_shows_every_setting(capsys):
         (ValueError("a\n b"), 2, "error: a b\n"),
         (FileNotFoundError(2, "No such file", "x"), 2, "error: [Errno 2] No such file: 'x'\n"),
         (KeyboardInterrupt(), 130, ""),
+        (ImportError("no libfoo"), 2, f"error: {cannot_load(ImportError('no libfoo'))}\n"),
     ],
 )
 def test_bad_input_is_one_line_and_a_status(capsys, monkeypatch, error, status, said):
