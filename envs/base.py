@@ -31,8 +31,8 @@ class Physics:
     """What the next physics step needs (``models.CARRIED``); the rest of mjx.Data follows from it.
 
     time: [] since the start of the episode (s)
-    qpos: [nq] generalised positions (m, rad)
-    qvel: [nv] generalised velocities (m/s, rad/s)
+    qpos: [nq] generalized positions (m, rad)
+    qvel: [nv] generalized velocities (m/s, rad/s)
     act: [na] activations of the actuators that have a state
     qacc_warmstart: [nv] where the constraint solver starts (m/s^2, rad/s^2)
     carried: fields of the last step's mjx.Data that the next outcome reads, by their names
@@ -198,8 +198,8 @@ class MujocoEnv(Env):
         """Returns the state at given positions and velocities, as Gymnasium's ``set_state``.
 
         Args:
-          qpos: [nq] generalised positions (m, rad).
-          qvel: [nv] generalised velocities (m/s, rad/s).
+          qpos: [nq] generalized positions (m, rad).
+          qvel: [nv] generalized velocities (m/s, rad/s).
           episode: what the task's ``randomize`` returns, where it has one.
         """
         check_shape("qpos", qpos, (self.mj_model.nq,))
@@ -221,7 +221,7 @@ class MujocoEnv(Env):
     ) -> State:
         """Returns the state at positions and velocities, from one forward pass."""
         start = models.make_data(self.mj_model).replace(qpos=qpos, qvel=qvel)
-        # MJX normalises quaternions in qpos itself; MuJoCo does so when it steps.
+        # MJX normalizes quaternions in qpos itself; MuJoCo does so when it steps.
         if self._stays_whole(episode):
             data, _ = self._whole("start", start)
         else:

@@ -1,4 +1,4 @@
-"""REINFORCE on MuJoCo, vectorised over episodes and seeds.
+"""REINFORCE on MuJoCo, vectorized over episodes and seeds.
 
 The public names are imported on first use, so that ``import mjx_reinforce``
 and ``python -m mjx_reinforce.train --help`` stay quick: neither MJX nor brax

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class NewSettings:
-    """Write the class of an environment from a MuJoCo model; its reward is yours to write."""
+    """Write the class of an environment for a MuJoCo model, with a reward for you to change."""
 
     model: tyro.conf.Positional[Path]
     """The model, .xml."""
@@ -69,9 +69,14 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
     """
     timestep = float(model.opt.timestep)
     frame_skip = max(1, round(0.04 / timestep))
-    moves = model.njnt > 0 and model.jnt_type[0] == 0  # a robot that stands on its own
-    observed = ["data.qpos[2:]" if moves else "data.qpos", "data.qvel"]
-    template = Path(__file__).with_name("new_task.txt").read_text("utf-8")
+    moves = int(model.njnt > 0 and model.jnt_type[0] == 0)  # a robot that stands on its own
+    joints = [model.joint(i).name for i in range(moves, model.njnt)]
+    observed = [f"joint({json.dumps(name)}).qpos" for name in joints]
+    if not all(joints):
+        observed = ["qpos[7:]" if moves else "qpos"]
+    observed = ["qpos[2:7]"] * moves + observed + ["qvel"] + ["sensordata"] * (model.nsensor > 0)
+    parts = "new_task.txt", "new_walk.txt" if moves else "new_hold.txt"
+    template = "".join(Path(__file__).with_name(part).read_text("utf-8") for part in parts)
     return template.format(
         title=_title(module),
         module=module,
@@ -81,7 +86,7 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
         steps=round(5 / (frame_skip * timestep)) or 1,
         nv=model.nv,
         pose="self.mj_model.key_qpos[0]" if model.nkey else "self.mj_model.qpos0",
-        observed=", ".join(observed + ["data.sensordata"] * (model.nsensordata > 0)),
+        observed="".join(f"                data.{part},\n" for part in observed),
         about="\n".join(_about(model)),
     )
 
@@ -92,9 +97,7 @@ def _title(module: str) -> str:
 
 
 def _about(model: "MjModel") -> Iterator[str]:
-    """Yields the lines of the class's docstring: where its joints and actions stand."""
-    for i in range(model.njnt):
-        yield f"    qpos[{model.jnt_qposadr[i]}]: joint {json.dumps(model.joint(i).name)}"
+    """Yields the lines of the class's docstring: what its actions move."""
     for i in range(model.nu):
         low, high = model.actuator_ctrlrange[i]
         limits = f" in [{low:g}, {high:g}]" if model.actuator_ctrllimited[i] else ""

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class Episode(NamedTuple):
     """One episode to its end: its own, the time limit, or where it leaves the finite numbers.
 
-    qpos: [L, nq] generalised positions (m, rad), the start's first
+    qpos: [L, nq] generalized positions (m, rad), the start's first
     rewards: [T], nan in a step that left the finite numbers
     """
 

@@ -30,14 +30,14 @@ class ReportSettings:
     """
 
     sources: tyro.conf.Positional[tuple[Path, ...]]
-    """Run or sweep directories of one task, which are compared."""
+    """Directories of runs or sweeps of one task."""
     output: Path | None = None
-    """The page. By default report.html in the run or sweep that it is of, or, of several, in the
-    current folder. Its pictures and tables go into a folder of the same name without .html."""
+    """The page. By default report.html in the directory of the run or sweep; if there are several,
+    in the current folder. Pictures and tables go into a folder of that name, without .html."""
     overwrite: bool = False
-    """Replace a page that exists, and the pictures and tables of the same names beside it."""
+    """Replace a page that exists, with its pictures and tables."""
     labels: tuple[str, ...] = ()
-    """Other names for configurations, each OLD=NEW; NEW has no "=" in it:
+    """New names for configurations, each OLD=NEW. NEW must have no "=". Example:
     --labels "estimator reinforce=REINFORCE" "estimator leave-one-out=leave-one-out baseline"."""
 
 

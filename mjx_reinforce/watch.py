@@ -1,4 +1,4 @@
-"""``python -m mjx_reinforce.watch RUN`` plays a trained policy and makes a film of it."""
+"""``python -m mjx_reinforce.watch RUN`` plays a trained policy and makes a video of it."""
 
 import dataclasses
 from contextlib import AbstractContextManager
@@ -31,41 +31,39 @@ _RANGES = (("width", 1, 4096), ("height", 1, 4096), ("episode", 0, 2**31 - 1))
 
 @dataclasses.dataclass(frozen=True)
 class WatchSettings:
-    """Play one episode of a trained policy, print its return, and make a film of it."""
+    """Play one episode of a trained policy, print its return, and make a video of it."""
 
     run: tyro.conf.Positional[Path] = RUNS
-    """The run directory that training left; or a folder of runs, whose newest plays; or the name of
-    a task, such as HalfCheetah-v5, whose trained policy comes with the package."""
+    """A run directory; a folder of runs, of which the newest plays; or a task such as
+    HalfCheetah-v5, whose trained policy comes with the package."""
     env: str | None = None
-    """Needed where a run was trained on module:Class, code of your own or of another: that name
-    again, for then it is run."""
+    """If the run was trained on module:Class, that name again: its code runs only if named."""
     policy: str | None = None
-    """Needed where the distribution of a run is module:name, as --env is."""
+    """If the distribution of the run is module:name, that name again."""
     seed: SeedChoice = "best"
-    """Which of the run's seeds plays: best, worst or median by its final evaluation, or a number.
-    """
+    """Seed that plays: best, worst or median by its final evaluation, or a number."""
     which: Which = "last"
-    """The policy at the end of training, or the one that did best on the way, if it was kept."""
+    """The policy at the end of training (last), or the best at any evaluation, if it was kept."""
     beside: Literal["untrained"] | SeedChoice | None = None
     """A second policy, on the left, from the same start: untrained (before and after), or another
     seed of the run, such as worst."""
     backend: Literal["mjx", "mujoco"] | None = None
-    """Which simulation is filmed: "mjx", as in training, or "mujoco", C MuJoCo, which starts at
-    once. By default mjx for a run, mujoco for a policy of the package."""
+    """Simulation that plays: mjx, as in training, or mujoco, C MuJoCo, which starts at once. By
+    default mjx for a run, mujoco for a policy of the package."""
     episode: int = 0
-    """Number of the start state; the same number, the same start."""
+    """Number of the start state. The same number gives the same start."""
     noise: bool = False
     """Draw actions from the policy, as training does, instead of taking its mode."""
     output: Path | None = None
-    """The film, .gif. By default RUN/seed-NUMBER.gif; for a policy of the package TASK.gif."""
+    """The video, .gif. By default RUN/seed-NUMBER.gif, or TASK.gif for a policy of the package."""
     seconds: float = 20.0
-    """Length of the film at most, in simulated seconds; the episode is played to its end."""
+    """Most simulated seconds that the video shows. The episode is played to its end."""
     width: int = 480
-    """Pixels of each policy's picture."""
+    """Width of each policy's picture, in pixels."""
     height: int = 360
-    """Pixels, without the words below."""
+    """Height of the picture, in pixels, without the caption."""
     overwrite: bool = False
-    """Replace a film that exists."""
+    """Replace a video that exists."""
 
 
 def main() -> None:

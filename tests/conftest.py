@@ -1,4 +1,4 @@
-"""Shared settings of the tests: what they compile is kept, and nothing is optimised for speed.
+"""Shared settings of the tests: what they compile is kept, and nothing is optimized for speed.
 
 They run on the CPU unless JAX_PLATFORMS names something else.
 """

@@ -128,6 +128,6 @@ print(f"median distance at the end: {100 * np.median(distance[-1]):.1f} cm")
 #
 # 1. Your own MJCF: `xml_file="my_robot.xml"`. `python -m mjx_reinforce.new my_robot.xml` begins the class.
 # 2. Let the mass vary: `randomize` may also return `{"body_mass": self.model.body_mass * factor}`.
-# 3. A film: `python -m mjx_reinforce.watch RUN --env my_module:Arm`, of a run that `run(config, output="RUN")` wrote.
+# 3. A video: `python -m mjx_reinforce.watch RUN --env my_module:Arm`, of a run that `run(config, output="RUN")` wrote.
 #
 # [Your own environment](../own_task.md) says what models may have, and what is refused.

@@ -57,7 +57,7 @@ for n in counts:
 fig, (left, right) = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
 for discount, each in zip(discounts, returns, strict=True):
     left.hist(each, bins=40, histtype="step", label=f"discount {discount}")
-left.set(xlabel="return at the end", ylabel="seeds")
+left.set(xlabel="final return", ylabel="seeds")
 left.legend()
 right.semilogx(counts, wrong, "o-")
 right.set_xticks(counts, counts, minor=False)

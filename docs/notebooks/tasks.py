@@ -20,7 +20,7 @@ for task in TASKS:
     config = mr.of_task(task, num_seeds=2)
     trained[task] = mr.run(config, quiet=True)
     print(
-        f"{task}: {trained[task].test_returns.mean():.0f} after {config.env_steps:,} env steps a seed,"
+        f"{task}: {trained[task].test_returns.mean():.0f} after {config.env_steps:,} env steps per seed,"
         f" {time.perf_counter() - begin:.0f} s with compiling"
     )
 

@@ -59,7 +59,7 @@ class Humanoid(Person, Healthy):
     """Gymnasium's Humanoid (gymnasium/envs/mujoco/humanoid_v5.py), solver apart.
 
     Gymnasium's model asks for MuJoCo's PGS solver, which MJX lacks. This one asks for Newton, which
-    minimises the same function to a tighter tolerance: the two differ where PGS stops early.
+    minimizes the same function to a tighter tolerance: the two differ where PGS stops early.
 
     Observation, O = 348: height of the torso (m), its orientation (quaternion), 17 joint angles
     (rad), 22 in all; their 23 velocities (m/s, rad/s); for each of 13 bodies inertia about the
@@ -112,7 +112,7 @@ class HumanoidStandup(Person):
     """Gymnasium's HumanoidStandup (gymnasium/envs/mujoco/humanoidstandup_v5.py), solver apart.
 
     Gymnasium's model asks for MuJoCo's PGS solver, which MJX lacks. This one asks for Newton, which
-    minimises the same function to a tighter tolerance: the two differ where PGS stops early.
+    minimizes the same function to a tighter tolerance: the two differ where PGS stops early.
 
     Observation, O = 348, and action, A = 17: as Humanoid.
 

@@ -27,7 +27,7 @@ TASKS = tuple(id for id in envs.names() if id.endswith("-v5"))
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Compares vectorised environments."""
+    """Compares vectorized environments."""
 
     envs: tuple[str, ...] = TASKS
     """The tasks."""

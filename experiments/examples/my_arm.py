@@ -1,6 +1,6 @@
 r"""Your own robot: an arm that learns to reach for a ball, its MJCF in my_arm.xml.
 
-Two commands in this folder, the first of half a minute on two cores, train and film it:
+Two commands in this folder, the first of half a minute on two cores, train it and make a video:
 
     python -m mjx_reinforce.train --env my_arm:Arm --output arm --num-episodes 64 \
         --env-steps 2000000

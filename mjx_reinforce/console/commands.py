@@ -8,14 +8,14 @@ SCRIPT = "mjx-reinforce"
 #: Command -> (the module whose ``main`` it is, what it does).
 COMMANDS = {
     "train": ("mjx_reinforce.train", "train policies, many seeds at once"),
-    "watch": ("mjx_reinforce.watch", "make a film of a trained policy, by default of the last run"),
+    "watch": ("mjx_reinforce.watch", "make a video of a trained policy, or of the newest run"),
     "sweep": (
         "mjx_reinforce.runs.sweep_command",
         "train many configurations at once, and compare them",
     ),
-    "report": ("mjx_reinforce.report", "make a page of figures of runs and sweeps"),
+    "report": ("mjx_reinforce.report", "make a page with figures of runs and sweeps"),
     "export": ("mjx_reinforce.export.__main__", "write a policy for NumPy alone"),
-    "new": ("mjx_reinforce.new", "write the class of a task from a MuJoCo model"),
+    "new": ("mjx_reinforce.new", "write the class of a task for a MuJoCo model"),
     "envs": ("mjx_reinforce.envs.__main__", "list the tasks, or describe one"),
 }
 

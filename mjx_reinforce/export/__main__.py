@@ -12,17 +12,17 @@ from mjx_reinforce.settings.flags import run_command
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ExportSettings:
-    """Write a trained policy without noise for NumPy alone: an archive .npz and a short .py."""
+    """Write a trained policy as NumPy alone: an archive .npz and a short .py, without noise."""
 
     run: tyro.conf.Positional[Path]
-    """The run directory that training left, or a task whose policy comes with the package."""
+    """A run directory, or a task whose trained policy comes with the package."""
     seed: SeedChoice = "best"
-    """Which of the run's seeds: best, worst or median by its final evaluation, or a number."""
+    """Seed to export: best, worst or median by its final evaluation, or a number."""
     which: Which = "last"
-    """The policy at the end of training, or the one that did best on the way, if it was kept."""
+    """The policy at the end of training (last), or the best at any evaluation, if it was kept."""
     output: Path | None = None
-    """The archive, .npz. By default seed_NUMBER in the run directory; of a policy of the
-    package, the name of its task in the current folder."""
+    """The archive, .npz. By default seed_NUMBER in the run directory, or the name of the task in
+    the current folder for a policy of the package."""
     overwrite: bool = False
     """Replace files that exist."""
 

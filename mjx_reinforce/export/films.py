@@ -14,11 +14,11 @@ import numpy as np
 
 if TYPE_CHECKING:
     from mjx_reinforce.engine.base import MjModel, MjSpec
-#: Colours of a .gif, beside the one that is transparent.
+#: Colors of a .gif, beside the one that is transparent.
 _COLORS = 255
 #: What MuJoCo's backends need that are not EGL.
 _NEEDS = {"glfw": "a screen", "osmesa": "the library OSMesa"}
-#: Pictures, spread over a film, whose colours it has.
+#: Pictures, spread over a film, whose colors it has.
 SAMPLES = 4
 
 
@@ -56,7 +56,7 @@ class Renderer:
         """Returns a picture [height, width, 3] uint8.
 
         Args:
-          qpos: [nq] generalised positions.
+          qpos: [nq] generalized positions.
         """
         mujoco, data = import_mujoco(), self._data
         data.qpos[:] = qpos
@@ -136,7 +136,7 @@ class Take(NamedTuple):
     label: what is seen
     model: what is drawn, an ``MjModel``
     dt: the duration of an env step (s)
-    qpos: [L, nq] generalised positions (m, rad), the start's first
+    qpos: [L, nq] generalized positions (m, rad), the start's first
     rewards: [T] of each env step
     """
 
@@ -152,7 +152,7 @@ class Film(NamedTuple):
 
     rate: frames a second
     length: how many frames
-    samples: numbers of frames that together show its colours
+    samples: numbers of frames that together show its colors
     draw: number of the frame -> picture [height, width, 3] uint8
     """
 
@@ -185,7 +185,7 @@ def side_by_side(
       ValueError: there is no take, or no OpenGL.
     """
     if not takes:
-        raise ValueError("a film needs at least one take")
+        raise ValueError("a video needs at least one take")
     dt = max(take.dt for take in takes)
     interval = dt * max(1, math.ceil(1 / (dt * max_rate) - 1e-9))
     lasting = max(min(len(take.qpos) * take.dt, seconds) for take in takes)
@@ -248,7 +248,7 @@ def gif(
     Args:
       frames: pictures [height, width, 3] uint8.
       rate: frames a second.
-      samples: a few of the pictures; the film has the colours that show these best.
+      samples: a few of the pictures; the film has the colors that show these best.
       colors: how many.
     """
     from PIL import Image
@@ -270,7 +270,7 @@ def gif(
             yield picture
 
     film, drawn = io.BytesIO(), pictures()
-    # To optimise is to look for colours that a picture lacks: it takes four times as long.
+    # To optimize is to look for colors that a picture lacks: it takes four times as long.
     next(drawn).save(
         *(film, "GIF"), save_all=True, append_images=drawn, loop=0, optimize=False, **options
     )

@@ -95,7 +95,7 @@ def check_estimator(
     check_kind("estimator", estimator, Estimator, "mjx_reinforce.reward_to_go(0.99)")
     if num_episodes < estimator.min_episodes:
         raise ValueError(
-            f"this estimator needs at least {estimator.min_episodes} episodes an update, "
+            f"this estimator needs at least {estimator.min_episodes} episodes per update, "
             f"got num_episodes={num_episodes}"
         )
     shape, action = (_NUM_STEPS, num_episodes), null_action(env)

@@ -35,7 +35,7 @@ class Estimator(NamedTuple):
     Attributes:
       init: (key, observation_size) -> state; consumes the key
       update: (state, trajectory) -> (weight [T, N], next state, metrics); the weight
-        is zero outside the mask, and the trajectory's observations are normalised; what an episode
+        is zero outside the mask, and the trajectory's observations are normalized; what an episode
         earned that broke (``trajectory.nonfinite``) is no return, see ``replace_broken``
       min_episodes: the least N that ``update`` accepts
 

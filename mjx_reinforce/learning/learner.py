@@ -39,7 +39,7 @@ class TrainState(struct.PyTreeNode, kw_only=True):
       progress: [] the share of the budget that is used, for what changes with it, such as the
         learning rate; the caller of the learner sets it
       actor: the policy's parameters and the observation statistics
-      opt_state: the optimiser's state
+      opt_state: the optimizer's state
       estimator_state: the estimator's, such as a critic
       start_key: [] what every episode is reset with, where all start alike; else None
 
@@ -149,7 +149,7 @@ def reinforce(
     with the weights that the estimator gives. An episode in which the simulation left the finite
     numbers counts as the worst of the others; where all did, nothing is learned.
 
-    Numbers such as ``entropy_cost``, the estimator's discount and the optimiser's learning rate
+    Numbers such as ``entropy_cost``, the estimator's discount and the optimizer's learning rate
     may be traced: build the learner inside a function to vmap over them.
 
     Args:
@@ -158,7 +158,7 @@ def reinforce(
       estimator: by default leave-one-out on the return to go (discount 0.99), divided by its
         standard deviation plus 10.
       optimizer: by default Adam at 1e-2 with the gradient's norm clipped at 1.
-      update: how the gradient is spent, from ``updates``; by default in one optimiser step.
+      update: how the gradient is spent, from ``updates``; by default in one optimizer step.
       num_episodes: N, episodes an update.
       horizon: T, steps after which an episode ends; by default ``env.max_episode_steps``.
       entropy_cost: weight of the policy's entropy H, in return per nat.

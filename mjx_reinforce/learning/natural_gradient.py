@@ -41,7 +41,7 @@ def natural_gradient(
     The step's length is that at which the quadratic model of the KL divergence, half the square of
     the step in F + damping I, is ``max_kl``: sqrt(2 max_kl / g'x) x (Schulman et al. 2015,
     arXiv:1502.05477, appendix C; Rajeswaran et al. 2017, arXiv:1703.02660, equation 5, who leave
-    out the 2). The scale of the weights has no effect on it. The optimiser is given that step in
+    out the 2). The scale of the weights has no effect on it. The optimizer is given that step in
     the place of a gradient: ``optax.sgd(1.0)`` makes the step as it is, and a schedule shortens it.
     ``reinforce(max_kl=...)`` shortens a step for which the model was too good.
 

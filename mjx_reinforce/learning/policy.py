@@ -41,7 +41,7 @@ class MLP(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Returns [..., num_outputs] of ``x`` [..., O]; ValueError: unknown initialiser."""
+        """Returns [..., num_outputs] of ``x`` [..., O]; ValueError: unknown initializer."""
         check_name("initializer", self.initializer, dict.fromkeys(INITIALIZERS))
         if units.wanted(x) and not self.is_initializing():
             params = self.variables["params"]
@@ -58,7 +58,7 @@ class MLP(nn.Module):
 
 
 def _symmetric_uniform(bound: float) -> nn.initializers.Initializer:
-    """Returns an initialiser that draws from the uniform distribution on (-bound, bound)."""
+    """Returns an initializer that draws from the uniform distribution on (-bound, bound)."""
 
     def draw(key, shape, dtype=float, out_sharding=None):
         del out_sharding
@@ -119,7 +119,7 @@ def mlp_policy(
       and ``"scale_network"`` without a shared trunk.
 
     Raises:
-      ValueError: a layer has no units, the initialiser is unknown, or a second network
+      ValueError: a layer has no units, the initializer is unknown, or a second network
         is asked for and no standard deviation depends on the observation.
 
     Examples:

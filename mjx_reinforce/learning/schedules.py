@@ -1,7 +1,7 @@
-"""What changes as a run goes on: behind an optimiser, and in how episodes are cut.
+"""What changes as a run goes on: behind an optimizer, and in how episodes are cut.
 
 Optax transformations go by the share of the budget that is used, which ``updates`` tells the
-optimiser of, or by the env steps played. Counted in env steps, a policy whose episodes are short
+optimizer of, or by the env steps played. Counted in env steps, a policy whose episodes are short
 keeps its rate and its noise, and one that has learned to play long ones settles soon.
 """
 

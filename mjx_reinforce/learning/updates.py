@@ -59,15 +59,15 @@ _NOISE_SHARE, _NOISE_EPISODES = 32, 64
 
 #: (problem, key, params, opt_state) -> (params, opt_state, metrics); may consume the key. The
 #: metrics are ``entropy``, the mean over samples; ``gradient_norm`` and, where ``make_optimizer``
-#: made the optimiser and it clips, ``clipped_gradients`` (1 or 0), means over optimiser steps; and
+#: made the optimizer and it clips, ``clipped_gradients`` (1 or 0), means over optimizer steps; and
 #: what an update adds.
 Update = Callable[[Problem, jax.Array, Any, Any], tuple[Any, Any, dict[str, Any]]]
-#: (problem, key, params, gradient) -> what the optimiser is given for it; may consume the key.
+#: (problem, key, params, gradient) -> what the optimizer is given for it; may consume the key.
 Turn = Callable[[Problem, jax.Array, Any, Any], Any]
 
 
 def full_batch() -> Update:
-    """One optimiser step on the gradient of the whole rollout.
+    """One optimizer step on the gradient of the whole rollout.
 
     Of two episodes or more, its metrics have ``gradient_snr``, the signal-to-noise ratio over
     episodes of that gradient, see ``signal_to_noise``. The noise is estimated from one
@@ -126,9 +126,9 @@ def descend(
     opt_state: optax.OptState,
     turn: Callable[[Any], Any] = lambda gradient: gradient,
 ) -> tuple[Any, Any, dict[str, jax.Array]]:
-    """Makes one optimiser step on summed gradients; also returns the metrics of that step.
+    """Makes one optimizer step on summed gradients; also returns the metrics of that step.
 
-    The optimiser is given what ``turn`` makes of the mean gradient.
+    The optimizer is given what ``turn`` makes of the mean gradient.
     """
     grads = jax.tree.map(lambda g: g / divisor, grads)
     optimizer = optax.with_extra_args_support(problem.optimizer)
@@ -172,11 +172,11 @@ def make_optimizer(
     max_grad_norm: float | jax.Array | None = 1.0,
     momentum: float | jax.Array = 0.9,
 ) -> optax.GradientTransformation:
-    """Builds an optimiser with the constants that PyTorch and optax share.
+    """Builds an optimizer with the constants that PyTorch and optax share.
 
     Args:
       name: "adam" or "sgd".
-      learning_rate: a number or an optax schedule over optimiser steps.
+      learning_rate: a number or an optax schedule over optimizer steps.
       max_grad_norm: the gradient is scaled down to at most this Euclidean norm; None leaves it as
         it is.
       momentum: b1 of Adam; sgd has none.

@@ -60,14 +60,14 @@ def value_baseline(
 
     V reads the time besides the observation, for what is still earned depends on the steps that
     are left (Pardo et al. 2018, arXiv:1712.00378). Each update goes on from the network and the
-    optimiser's state that the last one left, and fits them to G in units of its running standard
+    optimizer's state that the last one left, and fits them to G in units of its running standard
     deviation, from its running mean, so that a learning rate means the same in every task. (Before
     the first update V is 0.)
 
     Args:
       discount: in [0, 1].
       horizon: steps after which the time counts as 1.
-      network: a flax module from [..., O + 1], the normalised observation and the time, to
+      network: a flax module from [..., O + 1], the normalized observation and the time, to
         [..., 1]; by default an MLP of 64 and 64 tanh units.
       optimizer: what fits it; by default Adam at 3e-3.
       num_fits: gradient steps on the mean squared error, each update.
@@ -132,7 +132,7 @@ def value_baseline(
 
 
 class FullBatchCritic(NamedTuple):
-    """State of ``full_batch_value_baseline``: the network's parameters, its optimiser's state."""
+    """State of ``full_batch_value_baseline``: the network's parameters, its optimizer's state."""
 
     params: Any
     opt_state: Any
@@ -203,7 +203,7 @@ def _defaults(
     network: nn.Module | None,
     optimizer: optax.GradientTransformation | None,
 ) -> tuple[Estimator, nn.Module, optax.GradientTransformation]:
-    """Returns what gives the returns to go, the network, and the optimiser."""
+    """Returns what gives the returns to go, the network, and the optimizer."""
     network = MLP((64, 64), 1) if network is None else network
     return reward_to_go(discount), network, optax.adam(3e-3) if optimizer is None else optimizer
 

@@ -49,7 +49,7 @@ def mean_log_prob(discount: float | jax.Array = 0.99) -> Estimator:
 
 
 def normalized_returns(discount: float | jax.Array = 0.99) -> Estimator:
-    """Weights an action by G[t], normalised within its episode.
+    """Weights an action by G[t], normalized within its episode.
 
     The weight is ``(G[t] - mean) / (std + 1.19e-7)``, with the mean and the
     unbiased standard deviation over the steps of the episode, and 0 in an episode
@@ -77,13 +77,13 @@ def normalized_returns(discount: float | jax.Array = 0.99) -> Estimator:
 
 
 def minibatches(num_updates: int, batch_size: int) -> Update:
-    """Several optimiser steps, each on steps drawn with replacement from all episodes.
+    """Several optimizer steps, each on steps drawn with replacement from all episodes.
 
     The loss is the mean over the minibatch, whatever the problem's divisor. From the second step
     on the samples are those of an older policy.
 
     Args:
-      num_updates: optimiser steps a rollout.
+      num_updates: optimizer steps a rollout.
       batch_size: steps of the episodes a minibatch.
 
     Raises:
@@ -121,7 +121,7 @@ def minibatches(num_updates: int, batch_size: int) -> Update:
 
 
 def each_step() -> Update:
-    """One optimiser step for every time step, in order, after all episodes are over.
+    """One optimizer step for every time step, in order, after all episodes are over.
 
     Step t follows its own share of the full gradient, the terms of all episodes at t, at the
     parameters that steps 0 to t - 1 have moved (Sutton and Barto 2018, section 13.3, has

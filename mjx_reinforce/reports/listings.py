@@ -104,7 +104,7 @@ def _worst(findings: Findings) -> Listing:
     best, *others = findings.results
     seeds = [(best, s) for s in worst_seeds(best)]
     seeds += [(each, worst_seeds(each)[0]) for each in others[: COMPARED - 1]]
-    header = ["configuration", "seed", "return at the end", "best return"]
+    header = ["configuration", "seed", "final return", "best return"]
     if findings.experiment.threshold is not None:
         header.append("first solved at")
     rows = []

@@ -69,7 +69,7 @@ def of_best(findings: Findings) -> list[Comparison]:
 def headline(findings: Findings) -> list[str]:
     """Returns the answer in a few sentences: who is best, by how much, and how surely.
 
-    Where the returns at the end are a tie and one configuration surely learns faster, that is
+    Where the final returns are a tie and one configuration surely learns faster, that is
     first.
     """
     best = findings.results[0]
@@ -87,7 +87,7 @@ def headline(findings: Findings) -> list[str]:
     said = [first, *_ahead(findings), *_solving(findings), *_few(findings)]
     speed = _speed(findings)
     if speed and len(ties) == len(of_best(findings)):
-        return [f"{speed}; the returns at the end are a tie.", *said]
+        return [f"{speed}; the final returns are a tie.", *said]
     return [*said, f"{speed}."] if speed else said
 
 
@@ -210,7 +210,7 @@ def caveats(findings: Findings) -> Iterator[str]:
     ends = [float(np.median(each.configuration.env_steps[-1])) for each in results]
     if max(ends) > 1.1 * min(ends):
         yield (
-            f"Budgets differ: {steps(min(ends))} to {steps(max(ends))} env steps a seed. Each is "
+            f"Budgets differ: {steps(min(ends))} to {steps(max(ends))} env steps per seed. Each is "
             "judged at its own end."
         )
     if _rises(results[0].band):

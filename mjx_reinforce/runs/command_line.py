@@ -48,20 +48,20 @@ class _Program(NamedTuple):
 
 
 _TRAIN = _Program(
-    "Train policies by REINFORCE on MuJoCo, many seeds at once, and report over the seeds. Leaves "
+    "Train policies by REINFORCE on MuJoCo, many seeds at once, and report over the seeds. Writes "
     "config.json, metrics.csv, returns.npz, summary.json, learning_curve.png, policy/, checkpoint/ "
-    "in the run directory.\n\n"
-    "Defaults depend on the task and on the budget: --help shows those of InvertedPendulum-v5, "
-    "--help --env ID those of another, for about a minute of training here, and with "
-    "--env-steps N those for N env steps.",
+    "into the run directory.\n\n"
+    "Defaults depend on the task and on the budget. --help shows those of InvertedPendulum-v5 for "
+    "about a minute of training on this machine. --help --env ID shows those of another task, and "
+    "with --env-steps N those for N env steps.",
     GROUPS,
 )
 _SWEEP = _Program(
-    "Train many configurations, many seeds of each, side by side. Leaves sweep.json, curves.npz, "
-    "report.html, report/results.csv (a row for each configuration and seed) and policies/ (those "
-    "of the best and the worst seed of each configuration) in the output directory. "
-    "All settings of python -m mjx_reinforce.train may be given, with its presets, and most may be "
-    "swept. Seed 3 of a configuration is seed 3 of train with these settings, up to rounding.",
+    "Train many configurations, many seeds of each, side by side. Writes sweep.json, curves.npz, "
+    "report.html, report/results.csv (a row for each configuration and seed) and policies/ (the "
+    "best and the worst seed of each configuration) into the output directory. Takes all settings "
+    "and presets of python -m mjx_reinforce.train; most settings can be swept. Seed 3 of a "
+    "configuration is seed 3 of train with these settings, up to rounding.",
     {"sweep": SweepSettings, **GROUPS},
     ("over", "chunk_runs", "exact", "env", "env_steps", "num_seeds", "output", "resume"),
 )

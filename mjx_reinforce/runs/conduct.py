@@ -195,7 +195,7 @@ def begin_run(
             slots.restore(found.states)
         env_steps = env_steps_in(60 * config.minutes, slots, config, interrupted)
         slots.restore(first)
-        say(f"{config.minutes:g} min are about {env_steps:,} env steps of a seed in all here")
+        say(f"{config.minutes:g} min are about {env_steps:,} env steps per seed here")
         config = dataclasses.replace(config, env_steps=env_steps, minutes=None)
     slots.budget = budget_of(config)
     config = dataclasses.replace(config, horizon=ready.horizon)

@@ -36,13 +36,13 @@ class SweepSettings:
     """What is swept, and how its runs are spread."""
 
     over: tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]] = ()
-    """A setting and its values, such as `learning-rate 1e-3 3e-3`; again for further settings: all
-    combinations are trained. Layers are written 32,32 (none: no layer)."""
+    """A setting and its values, such as `learning-rate 1e-3 3e-3`. Repeat it for more settings: all
+    combinations are trained. Write layers as 32,32 (none: a linear policy)."""
     chunk_runs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Runs that are under way at once at most; as many as memory holds if not given."""
+    """Most runs that train at the same time. If not given, as many as fit in memory."""
     exact: bool = False
-    """Move every run by itself, on one device, so that no result depends in any bit on the runs
-    beside it, on chunks, or on how many devices there are. It takes many times as long."""
+    """Train one run at a time, on one device. No bit of a result then depends on other runs,
+    chunks, or the number of devices. It takes many times as long."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -104,7 +104,7 @@ class Display(Observer[Driver]):
         self._bar.update(self._task, completed=now.fraction, done=done, left=left)
         if not self.console.is_terminal:
             self.say(
-                f"update {now.updates:5d}  {now.env_steps:12,.0f} env steps a seed  "
+                f"update {now.updates:5d}  {now.env_steps:12,.0f} env steps per seed  "
                 f"{_returns_and_speed(now)}  {done}  {left}".rstrip()
             )
 
@@ -172,7 +172,7 @@ def print_summary(console: Console, summary: dict[str, Any], directory: Path) ->
         table.add_row("last policies on fresh starts", f"{last:.1f}")
         lucky = " (their evaluation was luck)" * bool(best < last)
         table.add_row("best policies on fresh starts", f"{best:.1f}{lucky}")
-    table.add_row("env steps a second", f"{summary['env_steps_per_second']:,.0f}")
+    table.add_row("env steps per second", f"{summary['env_steps_per_second']:,.0f}")
     useful = percent_done(summary["useful_step_fraction"])
     table.add_row("steps of episodes, of all simulated", useful)
     table.add_row("compiling", f"{summary['compile_seconds']:.1f} s")

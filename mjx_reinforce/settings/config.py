@@ -181,7 +181,7 @@ def _check_reinforce(config: Config) -> None:
     """Raises ValueError for settings that do not go together."""
     if config.estimator.startswith("leave-one-out") and config.num_episodes < 2:
         raise ValueError(
-            f"{config.estimator} needs at least two episodes an update, got --num-episodes "
+            f"{config.estimator} needs at least two episodes per update, got --num-episodes "
             f"{config.num_episodes}; raise it or choose --estimator reward-to-go"
         )
     if config.policy == "deterministic":

@@ -79,18 +79,17 @@ class RunSettings:
     """Environment id, or module:Class for your own environment. `python -m mjx_reinforce.envs`
     lists the ids."""
     env_set: tuple[str, ...] = ()
-    """Settings of the environment, such as frame_skip=4; `envs ID` lists them."""
+    """Settings of the environment, such as frame_skip=4. `envs ID` lists them."""
     algorithm: str = "reinforce"
-    """reinforce follows the policy gradient; ars (augmented random search, Mania et al. 2018) tries
-    out changes of the parameters, with the numbers of mjx_reinforce.ars. A preset's name is its
-    program, without the preset's settings. Or module:name."""
+    """reinforce follows the policy gradient; ars is augmented random search (Mania et al. 2018); a
+    preset's name is its program without its settings. Or module:name."""
     num_seeds: int = setting(4, *COUNT, once="every configuration has as many seeds")
     """Number of independent seeds, trained together in one compiled program."""
     seeds: str | None = setting(
         None, Mark.NOT_COMPILED, once="every configuration has the same seeds"
     )
-    """FIRST:END, the seeds FIRST to END - 1 in place of --num-seeds: a share of a larger run, for
-    one of several machines. `report A B` joins shares."""
+    """FIRST:END, in place of --num-seeds: seeds FIRST to END - 1, a share of a larger run, for one
+    of several machines. `report A B` joins shares."""
     seed: int = setting(
         0,
         Range.SEED,
@@ -99,24 +98,24 @@ class RunSettings:
     )
     """Root of all randomness; the seeds' keys are split from it."""
     env_steps: int | None = setting(280_000, *TOTAL, Mark.BUDGET, Mark.NOT_COMPILED)
-    """Training budget of each seed in env steps; a seed stops after the update that reaches it.
-    By default about a minute of training here. None: only --max-updates counts."""
+    """Training budget per seed, in env steps; a seed stops after the update that reaches it. By
+    default, about a minute of training on this machine. None: only --max-updates counts."""
     minutes: float | None = setting(
         None, Range.POSITIVE, Mark.BUDGET, Mark.NOT_COMPILED, once="it is for one run"
     )
-    """Training time of all seeds together, in place of --env-steps. The first updates measure the
-    env steps, which config.json keeps: --like RUN repeats the run to the bit. If episodes grow, the
-    run ends early."""
+    """Training time of all seeds together, in place of --env-steps. The first updates measure how
+    many env steps fit. config.json keeps that number, so --like RUN repeats the run to the bit. If
+    episodes get longer, the run ends early."""
     max_updates: int | None = setting(None, *TOTAL, Mark.BUDGET, Mark.NOT_COMPILED)
     """Stop every seed after this many updates; with --num-episodes 1, as many episodes."""
     num_episodes: int = _for_gradients(16, *COUNT)
-    """Episodes that each seed plays for an update."""
+    """Episodes per update and seed."""
     horizon: int | None = setting(None, *COUNT)
     """Time limit of an episode in env steps. None: the environment's own limit."""
     train_horizon: int | None = setting(None, *COUNT)
     """Cut training episodes, not evaluations, after this many env steps."""
     whole_after: float = _for_gradients(1.0, Range.SHARE, Reader.CUT)
-    """Cut until this share of the budget is used."""
+    """Share of the budget after which --train-horizon no longer cuts episodes."""
     engine: Literal["auto", "vmap", "native"] = setting(
         "auto", once="it changes no result but by rounding"
     )
@@ -125,8 +124,8 @@ class RunSettings:
     like: Path | None = setting(None, Mark.PLACE, once="every configuration begins with it")
     """Take all settings from this run, except those on the command line."""
     init_from: str | None = setting(None, Mark.NOT_COMPILED, once="it is for one run")
-    """Start with the last policies of this run, which has the same policy settings. Seed i takes
-    the policy of seed i modulo that run's seeds."""
+    """Start from the last policies of this run, which must have the same policy settings. Seed i
+    takes the policy of seed i modulo the number of seeds there."""
     output: Path | None = setting(None, Mark.PLACE, once="it has one directory")
     """Directory of the run. If not given, runs/<env>-<time>."""
 
@@ -148,14 +147,14 @@ class PolicySettings:
     final_std: float | None = _for_reinforce(
         None, Range.POSITIVE, Reader.DECAY, Reader.FREE_STD, Mark.TRACED
     )
-    """Target of the standard deviation of the actions, reached over --decay-steps besides what
-    is learned. With --max-kl it may stay above. None: learned only."""
+    """Standard deviation of the actions after --decay-steps, apart from what is learned. With
+    --max-kl it may stay larger. None: learned only."""
     normalize_steps: int | None = setting(1000, Range.AT_LEAST_0, Range.INT32)
-    """Scale observations by their mean and standard deviation over about this many first steps. 0:
-    do not scale. None: update the statistics throughout training."""
+    """Scale observations by their mean and standard deviation over the first env steps, about this
+    many. 0: do not scale. None: update the statistics throughout training."""
     normalize_min_std: float = setting(0.0, Range.NOT_NEGATIVE, Reader.NORMALIZATION, Mark.TRACED)
-    """Lower bound on the std that scales observations, in the observation's unit: an entry that
-    barely varies in the first steps would be magnified."""
+    """Lower bound on the std that scales observations, in the observation's unit. Without it, an
+    entry that barely varies in the first env steps is magnified."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -163,11 +162,11 @@ class EstimatorSettings:
     """What multiplies the gradient of an action's log-probability (reinforce)."""
 
     estimator: str = _for_reinforce("leave-one-out")
-    """What weights the gradient: total-return; reward-to-go; leave-one-out (minus the mean of
-    the other episodes; one that is over counts as the 0 that it still earns), leave-one-out-alive
-    (minus the mean of those that still run, which may be less noisy); value-baseline (minus a
-    learned value). mean-log-prob and normalized-returns are published variants; their docstrings
-    explain them. Or module:name."""
+    """What weights the gradient: total-return; reward-to-go; leave-one-out (reward to go minus the
+    mean of the other episodes, where an episode that is over counts as 0); leave-one-out-alive
+    (minus the mean of the episodes that still run); value-baseline (minus a learned value).
+    mean-log-prob and normalized-returns are published variants, which their docstrings explain. Or
+    module:name."""
     discount: float = _for_gradients(0.99, Range.SHARE, Mark.TRACED)
     """Discount of rewards, in [0, 1]."""
     standardize_floor: float | None = _for_reinforce(10.0, Range.NOT_NEGATIVE, Mark.TRACED)
@@ -180,7 +179,7 @@ class EstimatorSettings:
     value_fits: int = _for_reinforce(32, *COUNT, Reader.VALUE_BASELINE)
     """Gradient steps of the value network in each update, on the squared error."""
     value_batch_size: int = _for_reinforce(256, *COUNT, Reader.VALUE_BASELINE)
-    """Env steps in each minibatch of the value network, drawn with replacement."""
+    """Env steps per minibatch of the value network, drawn with replacement."""
     value_hidden_sizes: tuple[int, ...] = _for_gradients(
         (64, 64), Range.LAYERS, Reader.VALUE_BASELINE
     )
@@ -192,8 +191,8 @@ class UpdateSettings:
     """How the gradient becomes changes of the parameters (reinforce)."""
 
     update: Literal["full-batch", "natural-gradient"] = _for_reinforce("full-batch")
-    """How a rollout changes the policy. full-batch: one optimizer step. natural-gradient: one
-    step of length --max-kl, which a decay of the learning rate shortens."""
+    """How an update changes the policy. full-batch: one optimizer step. natural-gradient: one step
+    of length --max-kl, which shrinks as the learning rate decays."""
     entropy_cost: float = _for_reinforce(0.0, Range.NOT_NEGATIVE, Mark.TRACED)
     """Weight of the policy's entropy in the objective."""
     optimizer: Literal["adam", "sgd"] = _for_reinforce("adam", Reader.OPTIMIZER)
@@ -201,20 +200,20 @@ class UpdateSettings:
     learning_rate: float = _for_gradients(1e-2, Range.POSITIVE, Reader.FIRST_RATE, Mark.TRACED)
     """Learning rate of the optimizer at the start of training."""
     momentum: float = _for_reinforce(0.9, Range.BELOW_1, Reader.OPTIMIZER, Reader.ADAM, Mark.TRACED)
-    """b1 of adam: the share of the last mean gradient that the next one keeps."""
+    """b1 of adam: the share of the running mean gradient that each step keeps."""
     final_learning_rate: float | None = _for_reinforce(
         None, Range.POSITIVE, Reader.DECAY, Mark.TRACED
     )
     """Learning rate after the linear decay. If not given, a tenth of --learning-rate."""
     decay_steps: int | Literal["budget"] | None = _for_reinforce("budget", *TOTAL, Mark.TRACED)
-    """Env steps of a seed over which the learning rate decays, and with --final-std also the
-    noise. budget: the length of the run. None: no decay."""
+    """Env steps per seed over which the learning rate decays; with --final-std, the noise decays
+    too. budget: the length of the run. None: no decay."""
     max_grad_norm: float | None = _for_reinforce(1.0, Range.POSITIVE, Reader.OPTIMIZER, Mark.TRACED)
     """Maximum Euclidean norm of the gradient; a longer gradient is scaled down. None: no
     maximum."""
     max_kl: float | None = _for_reinforce(None, Range.POSITIVE, Mark.TRACED)
-    """Approximate maximum of the mean KL divergence, in nats, between the policies before and
-    after an update, over the visited steps. A larger change is shortened. None: no maximum."""
+    """Most that an update may change the policy: the mean KL divergence (nats) before and after,
+    over the visited steps, approximately. A larger change is shortened. None: no maximum."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -224,10 +223,10 @@ class EvaluationSettings:
     eval_every: int = setting(5, *COUNT)
     """Updates between evaluations."""
     eval_episodes: int = setting(16, *COUNT)
-    """Episodes of an evaluation with the mode of the policy, and as many with samples. The
-    starts of a seed are the same at every evaluation."""
+    """Episodes per evaluation: this many without noise, and as many with it. A seed has the same
+    starts at every evaluation."""
     test_episodes: int | None = setting(None, *COUNT, once="it has no test")
-    """Episodes of the test at the end, from other starts than the evaluations. If not given,
+    """Episodes of the test at the end, from starts that no evaluation uses. If not given,
     --eval-episodes. The test plays --eval-episodes at a time."""
 
 
@@ -242,26 +241,26 @@ class CheckpointSettings:
     They are written after evaluations."""
     resume: Path | None = setting(None, Mark.PLACE, once="it goes on as a whole")
     """Resume the run in this directory, with its own settings. Only the budget may change:
-    --env-steps, --max-updates, --checkpoint-every. Names of your own code, module:Class or
-    module:name, are to be given again."""
+    --env-steps, --minutes, --max-updates, --checkpoint-every. Name your own code, module:Class or
+    module:name, again."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LogSettings:
     """Logs to which the rows of metrics.csv also go. The x axis of charts is the number of updates.
 
-    A column is empty where nothing is measured: gradient_snr, the signal-to-noise ratio of the
-    gradient over episodes, needs --update full-batch or natural-gradient, or ars, and two episodes
-    or directions; explained_variance a baseline; clipped_gradients --max-grad-norm.
+    Some columns are empty in some runs. gradient_snr, the signal-to-noise ratio of the gradient,
+    needs at least two episodes (or directions of ars). explained_variance needs a baseline.
+    clipped_gradients needs --max-grad-norm.
     """
 
     log: tuple[Literal["tensorboard", "wandb"], ...] = setting(
         (), Mark.NOT_COMPILED, once="what it measures is in curves.npz"
     )
-    """Of each column the interquartile mean, quantiles and the first 16 seeds. tensorboard: charts
-    in RUN/tensorboard; to see them, pip install tensorboard, then tensorboard --logdir RUN. wandb:
-    Weights & Biases (pip install wandb), written to RUN/wandb; wandb sync uploads it, or
-    WANDB_MODE=online during the run."""
+    """Log the interquartile mean, quantiles and first 16 seeds of each column. tensorboard: charts
+    in RUN/tensorboard; to see them, pip install tensorboard, then tensorboard --logdir RUN.
+    wandb: Weights & Biases (pip install wandb), offline in RUN/wandb; upload with wandb sync, or
+    set WANDB_MODE=online during the run."""
 
 
 #: The groups of --help, in order, under their titles.

@@ -61,16 +61,14 @@ def test_a_model_becomes_a_class_that_plays(tmp_path, monkeypatch, capsys):
     shutil.copy(EXAMPLES / "my_arm.xml", tmp_path / "my_robot-2.xml")
     monkeypatch.chdir(tmp_path)
     write(monkeypatch, "my_robot-2.xml")
-    said = capsys.readouterr().out
-    assert "python -m mjx_reinforce.train --env my_robot_2:MyRobot2 --output my_robot_2_run" in said
+    assert "--env my_robot_2:MyRobot2 --output my_robot_2_run" in capsys.readouterr().out
     monkeypatch.syspath_prepend(tmp_path)
     env = envs.make("my_robot_2:MyRobot2")
     state = jax.eval_shape(env.reset, jax.random.key(0))
     after = jax.eval_shape(env.step, state, jnp.zeros(3))
     assert after.obs.shape == (12,)
     assert set(after.metrics) == {"reward_pose", "reward_control"}
-    text = (tmp_path / "my_robot_2.py").read_text()
-    assert 'action[1]: actuator "shoulder" in [-0.523599, 1.74533]\n' in text
+    assert 'actuator "shoulder" in [-0.523599, ' in (tmp_path / "my_robot_2.py").read_text()
     lint("my_robot_2.py")
 
 
@@ -82,14 +80,13 @@ def test_names_of_a_model_cannot_break_the_class(tmp_path, monkeypatch):
     write(monkeypatch, "sensed.xml")
     monkeypatch.syspath_prepend(tmp_path)
     env = envs.make("sensed:Sensed")
-    assert env.dt == pytest.approx(0.04)
+    assert (env.dt, env.max_episode_steps) == (pytest.approx(0.04), 125)
     assert env.observation_size == 8 - 2 + 7 + 3
-    assert env.max_episode_steps == 125
-    assert r'qpos[7]: joint "say \"it\"\\"' in (tmp_path / "sensed.py").read_text()
+    assert r'data.joint("say \"it\"\\").qpos' in (tmp_path / "sensed.py").read_text()
 
 
 def test_a_walker_starts_in_its_key_frame(tmp_path, monkeypatch):
-    """It sees no place on the floor, and the reward asks for that pose."""
+    """It sees no place on the floor, speed pays, and a fall ends it."""
     key = '<keyframe><key qpos="0 0 .2 .6 0 .8 0 -1" ctrl="-.5"/></keyframe></mujoco>'
     text = SENSED.replace("<joint axis", '<joint name="j" range="-120 -30" axis')
     (tmp_path / "kept.xml").write_text(text.replace("</mujoco>", key))
@@ -102,7 +99,10 @@ def test_a_walker_starts_in_its_key_frame(tmp_path, monkeypatch):
     assert 0 < np.abs(qvel).max() < 0.1
     state = env.set_state(jnp.asarray(home), qvel)
     np.testing.assert_allclose(state.obs[:6], home[2:], atol=1e-6)
-    assert env.outcome(None, types.SimpleNamespace(qpos=home), jnp.zeros(1))[0] == 0
+    stands = types.SimpleNamespace(qpos=home)
+    fallen = types.SimpleNamespace(qpos=home + np.array([env.dt, 0, -0.1, 0, 0, 0, 0, 0]))
+    found = [env.outcome(stands, after, jnp.zeros(1))[:2] for after in (stands, fallen)]
+    assert found == [(1, False), (pytest.approx(2), True)]
     lint("kept.py")
 
 

@@ -138,7 +138,7 @@ def test_the_tables_of_both_pages(folder):
         "| 12.0 (B, 3 million) | none |",
         "| 6.00 (5.00, 7.00) | 7.75 (6.50, 9.00) after 90.0 s (stopped) | 3.00, 5.00 | not run |",
         "| Hopper-v5 | best (3) | 998.5 (",
-        "| [film](films/Hopper-v5-best.gif) |\n| Hopper-v5 | median (3) |",
+        "| [video](films/Hopper-v5-best.gif) |\n| Hopper-v5 | median (3) |",
         "| InvertedPendulum-v5 | 2 | 90,000 | 6.00 (",
         "| 4.00 | 1 of 2 (5) | 1,000.0 (1,000.0 to 1,000.0) | no interval | 10.0 min, 3.0 s | ",
         "| linear | 2 | 50.00 % (1) | 100.00 % (2) | 30,000 | 60,000 |",

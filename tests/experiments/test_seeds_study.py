@@ -28,19 +28,19 @@ SEEDS, BUDGET, COUNTS = 200, 1000, seeds_few.COUNTS
 LEARNED, _, _, GAMMA, _ = CONTRASTS
 
 
-def made_up(name, baseline, normalise):
+def made_up(name, baseline, normalize):
     """A task whose runs differ by known amounts.
 
-    A learned baseline adds ``baseline`` to every return; normalising adds ``normalise`` at the two
+    A learned baseline adds ``baseline`` to every return; normalizing adds ``normalize`` at the two
     lower learning rates and takes it away at the two higher ones; nothing else matters. The third
-    learning rate is the best without normalising, the second one with it.
+    learning rate is the best without normalizing, the second one with it.
     """
     random = np.random.default_rng(0)
     returns = 50 + random.normal(size=(*SHAPE, SEEDS))
     returns[FACTORS["estimator"].index("value-baseline")] += baseline
     returns += np.array([-10.0, -1.0, 0.0, -10.0])[:, None]
     sign = np.array([1.0, 1.0, -1.0, -1.0])[:, None]
-    returns[:, :, FACTORS["standardize"].index(True)] += normalise * sign
+    returns[:, :, FACTORS["standardize"].index(True)] += normalize * sign
     return Task(
         name=name,
         factors=FACTORS,
@@ -74,7 +74,7 @@ def made_up(name, baseline, normalise):
 
 @pytest.fixture(scope="module")
 def tasks():
-    return [made_up("Up-v0", baseline=5.0, normalise=3.0), made_up("Down-v0", -5.0, 0.0)]
+    return [made_up("Up-v0", baseline=5.0, normalize=3.0), made_up("Down-v0", -5.0, 0.0)]
 
 
 @pytest.fixture(scope="module")

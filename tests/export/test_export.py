@@ -21,7 +21,7 @@ BOX = {"action_low": [-3.0, -1.0, 0.5], "action_high": [3.0, -0.5, 2.0]}
 CASES = {
     "mlp": ({}, 50.0),
     "linear": ({"hidden_sizes": []}, 50.0),
-    "one layer, not normalised": ({"hidden_sizes": [8]}, 0.0),
+    "one layer, not normalized": ({"hidden_sizes": [8]}, 0.0),
     "not rescaled": ({"rescale": False}, 50.0),
 }
 

@@ -61,7 +61,7 @@ def test_there_is_one_policy_of_a_task_by_its_name():
 @pytest.mark.parametrize(("name", "needs"), [("GLFW", "a screen"), ("osmesa", "the library OSMe")])
 def test_a_renderer_that_is_not_here_is_answered_with_egl(monkeypatch, name, needs):
     def fail(*arguments):
-        warnings.warn("GLFW is not initialised", UserWarning, stacklevel=1)
+        warnings.warn("GLFW is not initialized", UserWarning, stacklevel=1)
         raise RuntimeError("an OpenGL platform library has not been loaded")
 
     monkeypatch.setenv("MUJOCO_GL", name)

@@ -24,7 +24,7 @@ SPACES = {
 def make_run(directory, env="CartPole-v1", *, count=50.0, folder="policy", **settings):
     """Writes what three seeds of training leave, as far as using a policy needs it.
 
-    count: how many observations the normaliser has counted
+    count: how many observations the normalizer has counted
     folder: where the policies go
     settings: of the policy, over those of ``SPACES``
     """

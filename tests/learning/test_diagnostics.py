@@ -43,7 +43,7 @@ def test_of_few_steps_all_are_visited():
     assert float(visited.mean(visited.observation[..., 0])) == pytest.approx(13 / 9, rel=1e-6)
 
 
-def test_of_many_steps_each_stands_for_its_neighbours(monkeypatch):
+def test_of_many_steps_each_stands_for_its_neighbors(monkeypatch):
     """Three of each episode: of 10 steps every fourth, of 2 both; each counts as its share."""
     monkeypatch.setattr(diagnostics, "MAX_COMPARED", 6)
     visited = diagnostics.visited_steps(make_trajectory([10, 2], 10))

@@ -243,7 +243,7 @@ def test_wrapping_keeps_what_an_estimator_requires_learns_and_measures(wrap):
     ],
 )
 def test_nothing_after_the_end_has_any_effect_on_the_weights(name, wrap):
-    """A normalised observation behind the end may be anything: no weight reads it."""
+    """A normalized observation behind the end may be anything: no weight reads it."""
     estimator = wrap(MAKERS[name](0.9))
     clean = weights(estimator, make_trajectory())
     poisoned = weights(estimator, make_trajectory(observation=np.nan, action=np.nan))

@@ -1,4 +1,4 @@
-"""The observation normaliser against numpy."""
+"""The observation normalizer against numpy."""
 
 import jax.numpy as jnp
 import numpy as np

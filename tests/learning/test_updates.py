@@ -1,4 +1,4 @@
-"""Updates and optimisers against loops by hand."""
+"""Updates and optimizers against loops by hand."""
 
 import functools
 
@@ -198,7 +198,7 @@ def clock(progress=0.0, env_steps=0.0):
     [("full-batch", None), ("full-batch", 10), ("minibatches", None), ("each-step", 10)],
 )
 def test_the_rate_falls_with_the_budget_or_with_env_steps(name, length):
-    """All optimiser steps of an update have the rate of its beginning."""
+    """All optimizer steps of an update have the rate of its beginning."""
     plain = updates.make_optimizer("sgd", 0.1, max_grad_norm=None)
     decaying = optax.chain(plain, schedules.decay_rate(0.2, length))
 

@@ -140,7 +140,7 @@ def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):
     assert error.count("\n") == 1
 
 
-def test_a_gif_has_the_colours_of_the_samples():
+def test_a_gif_has_the_colors_of_the_samples():
     """They are more than 256, the second half of them in the later samples alone."""
     ramp = np.arange(256, dtype=np.uint8)
     frames = np.zeros((6, 8, 256, 3), np.uint8)

@@ -30,7 +30,7 @@ def test_one_update_by_hand():
         env, policy=policy, num_directions=5, top_directions=2, step_size=0.3, noise_std=0.2
     )
     state = jax.jit(learner.init)(jax.random.key(0))
-    state, _ = train_step(learner, state)  # Observations are normalised from here on.
+    state, _ = train_step(learner, state)  # Observations are normalized from here on.
     flat, unflatten = jax.flatten_util.ravel_pytree(state.actor.params)
     _, play_key, _ = jax.random.split(state.key, 3)
     _, episodes_key = jax.random.split(play_key)

@@ -104,4 +104,4 @@ def test_a_chart_becomes_a_file_of_each_kind(found, drawn):
     assert files["png"].startswith(b"\x89PNG")
     assert files.keys() == {"png", "svg"}
     assert b"Final returns" in files["svg"]
-    assert b"var(--" not in files["svg"]  # the page's colours, by their values in light
+    assert b"var(--" not in files["svg"]  # the page's colors, by their values in light

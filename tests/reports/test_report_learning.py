@@ -44,7 +44,7 @@ def test_seeds_that_all_solve_are_told_apart_by_their_speed(tmp_path):
     all_solve(directory, [6, 2, 9])
     found = findings_of(directory)
     said = words.headline(found)
-    assert said[0] == "Fastest is learning rate 0.003; the returns at the end are a tie."
+    assert said[0] == "Fastest is learning rate 0.003; the final returns are a tie."
     rows = listings.listings(found)["speed"]["rows"]
     assert [row["label"][-5:] for row in rows] == ["0.003", "0.001", " 0.01"]
     assert rows[0]["cells"][2][0] == "fastest"
@@ -64,7 +64,7 @@ def test_what_is_surely_slower_is_named_where_two_are_equally_fast(tmp_path):
     all_solve(directory, [6, 2, 2])
     said = words.headline(findings_of(directory))
     slower = "faster than “learning rate 0.001”"
-    assert said[0] == f"learning rate 0.01 is surely {slower}; the returns at the end are a tie."
+    assert said[0] == f"learning rate 0.01 is surely {slower}; the final returns are a tie."
 
 
 def test_nobody_solves_it_is_no_race(tmp_path):

@@ -66,7 +66,7 @@ def test_minutes_become_env_steps_before_the_run_begins(ready, monkeypatch):
     timed = dataclasses.replace(CONFIG, minutes=0.5)
     driver = begin(ready, timed, say=said.append)
     assert (driver.config.env_steps, driver.config.minutes) == (30_000, None)
-    assert said == ["0.5 min are about 30,000 env steps of a seed in all here"]
+    assert said == ["0.5 min are about 30,000 env steps per seed here"]
     assert driver.config.horizon == ready.horizon
 
 

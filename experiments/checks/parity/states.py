@@ -58,7 +58,7 @@ def _pushed(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Moves a state a little or a lot, some of its joints to their limits, and makes it faster.
 
-    A quaternion may lose its length here; MuJoCo and MJX both normalise it.
+    A quaternion may lose its length here; MuJoCo and MJX both normalize it.
     """
     size = 10 ** random.uniform(-3, -0.5)
     qpos = qpos + size * random.uniform(-1, 1, qpos.shape)

@@ -88,7 +88,7 @@ def rollout_of(
 
 
 def training(env_id: str, name: str, batch: int, steps: int) -> Candidate:
-    """Whole updates of a 64-64 policy in float32: rollout, estimator, gradient and optimiser."""
+    """Whole updates of a 64-64 policy in float32: rollout, estimator, gradient and optimizer."""
     engine_name, arguments = ENGINES[name]
     env = Loop(envs.make(env_id, **arguments), steps)
     policy = mlp_policy(observation_size(env), default_distribution(action_space(env)), (64, 64))

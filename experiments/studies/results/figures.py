@@ -35,10 +35,10 @@ def draw(folder: Path, docs: Path, path: Path) -> None:
     for ax, task in zip(axes, tasks, strict=False):
         for (name, device), curve in found.items():
             if name == task:
-                colour = _CPU if "threads" in device else _GPU
+                color = _CPU if "threads" in device else _GPU
                 band = (curve["seconds"], curve["low"], curve["high"])
-                ax.fill_between(*band, color=colour, alpha=0.25)
-                ax.plot(curve["seconds"], curve["mean"], color=colour)
+                ax.fill_between(*band, color=color, alpha=0.25)
+                ax.plot(curve["seconds"], curve["mean"], color=color)
         for algorithm, style in (("PPO", "--"), ("SAC", ":")):
             if best := kept.published(docs / "published.csv", task, algorithm):
                 ax.axhline(best.mean, color="black", linestyle=style, linewidth=1)

@@ -14,7 +14,7 @@ from mjx_reinforce.watch import scene
 #: The tasks side by side, and the size of a file at most (bytes).
 _TASKS = ("Hopper-v5", "HalfCheetah-v5", "Walker2d-v5", "Ant-v5", "Humanoid-v5")
 LARGEST = 300_000
-#: How many colours a film has, if it may not have more.
+#: How many colors a film has, if it may not have more.
 _FEWER_COLORS = (128, 64, 32, 16, 8)
 
 
@@ -39,7 +39,7 @@ def save(path: Path, film: Film) -> None:
 
 
 def write_small_gif(path: Path, frames: Sequence[np.ndarray], rate: float, most_bytes: int) -> None:
-    """Writes a .gif of so many bytes at most, with as many colours as that allows.
+    """Writes a .gif of so many bytes at most, with as many colors as that allows.
 
     Args:
       path: .gif.
@@ -48,7 +48,7 @@ def write_small_gif(path: Path, frames: Sequence[np.ndarray], rate: float, most_
       most_bytes: of the file.
 
     Raises:
-      ValueError: the film is larger with the fewest colours.
+      ValueError: the film is larger with the fewest colors.
     """
     film, samples = b"", frames[:: -(-len(frames) // SAMPLES)]
     for colors in _FEWER_COLORS:

@@ -67,7 +67,7 @@ def verdict(ours: Estimate, published: tuple[float, float] | None) -> str:
 
 def of_tasks(results: Sequence[Result]) -> str:
     """Returns the table of all tasks by env steps."""
-    header = ["task", "seeds", "env steps a seed", "IQM (95 %)", "mean (95 %)", "worst seed"]
+    header = ["task", "seeds", "env steps per seed", "IQM (95 %)", "mean (95 %)", "worst seed"]
     header += ["solved at the end (threshold)", "published (95 %)", "our mean is"]
     return table([*header, "training, compiling", "machine"], map(_result_row, results))
 
@@ -134,7 +134,7 @@ def gpu(groups: Sequence[Group], docs: Path) -> str:
         if group.is_gpu
     ]
     header = ["task", "on", "seeds", "after a minute: mean, worst", "at the end: mean (95 %)"]
-    header += ["worst", "best seed", "seconds, all seeds", "env steps a seed", "PPO, published"]
+    header += ["worst", "best seed", "seconds, all seeds", "env steps per seed", "PPO, published"]
     return table([*header, "SAC, published"], rows)
 
 
@@ -202,10 +202,10 @@ def play(played: Mapping[str, Columns], docs: Path) -> str:
             returns = columns["return"]
             found = compare(returns[mine & ours], returns[mine & ~ours])
             film = Path("films", f"{task}-{policy}.gif")
-            shown = f"[film]({film.as_posix()})" if (docs / film).exists() else ""
+            shown = f"[video]({film.as_posix()})" if (docs / film).exists() else ""
             label = f"{policy} ({columns['seed'][mine][0]})"
             rows.append([task, label, *map(estimate, found), shown])
-    header = ["task", "policy (seed)", "here", "Gymnasium", "Gymnasium less here", "film"]
+    header = ["task", "policy (seed)", "here", "Gymnasium", "Gymnasium less here", "video"]
     return table(header, rows)
 
 

@@ -82,7 +82,7 @@ CONTRASTS = (
     Contrast("baseline", "estimator", ("value-baseline", "leave-one-out"), (_LEARNED, _OTHERS)),
     Contrast("baseline", "estimator", ("leave-one-out", "reward-to-go"), (_OTHERS, _NONE)),
     Contrast("discount", "discount_weights", (True, False), ("gamma^t", "without")),
-    Contrast("normalise", "standardize", (True, False), ("normalised", "raw")),
+    Contrast("normalize", "standardize", (True, False), ("normalized", "raw")),
 )
 
 

@@ -95,6 +95,6 @@ def task_table(tasks: Sequence[Task]) -> str:
                 *(record["engine"], time),
             ]
         )
-    header = ["task", "untrained", "solved at", "hidden units", "env steps a run"]
+    header = ["task", "untrained", "solved at", "hidden units", "env steps per run"]
     header += ["runs cut short", "runs not finite", "engine", "compiling, training"]
     return table(header, rows)

@@ -24,7 +24,7 @@ class Memory(NamedTuple):
     pointer: where its lane vector lies; the first one of an input, which stays until the end.
     dtype: of the entries.
     align: bytes of which the pointer is known to be a multiple; 1 leaves it to the dtype.
-      Neighbours that are known to be aligned are loaded together.
+      Neighbors that are known to be aligned are loaded together.
     """
 
     pointer: str

@@ -1,6 +1,6 @@
 r"""Joint limits in closed form, where at most two of them share a kinematic tree.
 
-MuJoCo's acceleration a minimises
+MuJoCo's acceleration a minimizes
 
     (a - a_s)' M (a - a_s) / 2 + \sum_i D_i min(0, J_i a - r_i)^2 / 2
 

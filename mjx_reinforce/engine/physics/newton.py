@@ -1,6 +1,6 @@
 r"""The constraint solver of C MuJoCo, with a line search that ends when it is exact.
 
-The acceleration a minimises (MuJoCo's documentation, "Computation", "Constraint model")
+The acceleration a minimizes (MuJoCo's documentation, "Computation", "Constraint model")
 
     (a - a_s)' M (a - a_s) / 2 + \sum_i D_i min(0, J_i a - r_i)^2 / 2
 
@@ -205,7 +205,7 @@ def smallest_decrement(model: mjx.Model, inertia: jax.Array) -> jax.Array:
 
 
 def _cost(rows: Rows, data: mjx.Data, point: _Point) -> jax.Array:
-    """Returns what is minimised, []."""
+    """Returns what is minimized, []."""
     active = rows.active(point.residual)
     penalty = jnp.sum(jnp.where(active, rows.constraint_mass * point.residual**2, 0))
     return (jnp.dot(point.imbalance, point.qacc - data.qacc_smooth) + penalty) / 2

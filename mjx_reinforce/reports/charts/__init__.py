@@ -3,7 +3,7 @@
 ``draw`` of a file yields a chart, or none where there is nothing to show. Charts are in Vega-Lite,
 see https://vega.github.io/vega-lite/docs/. They show the configurations whose labels are in the
 parameter ``shown``; the page's check boxes set it. ``at`` is the env step, and ``moment`` its
-number, that the page's slider sets. They name a colour as a CSS variable, so that one drawing fits
+number, that the page's slider sets. They name a color as a CSS variable, so that one drawing fits
 both grounds and print.
 """
 
@@ -33,7 +33,7 @@ _MOMENTS = 30
 _LOOK = json.loads(
     (resources.files("mjx_reinforce.reports") / "files" / "look.json").read_text("utf-8")
 )
-#: Colours by name. Those of the configurations are Okabe and Ito's, told apart by colour-blind
+#: Colors by name. Those of the configurations are Okabe and Ito's, told apart by color-blind
 #: people (https://jfly.uni-koeln.de/color/), without their yellow, which is lost on white.
 LIGHT, DARK = _LOOK["light"], _LOOK["dark"]
 #: How all charts look, for Vega-Lite.
@@ -41,21 +41,21 @@ CONFIG = _LOOK["config"]
 _NUM_COLOURS = sum(name.startswith("series-") for name in LIGHT)
 
 
-def colour(place: int) -> str:
-    """Returns the colour of the configuration at a place."""
+def color(place: int) -> str:
+    """Returns the color of the configuration at a place."""
     return f"var(--series-{place % _NUM_COLOURS})"
 
 
 def dash(place: int) -> list[int]:
     """Returns its dashes, as lengths of strokes and gaps.
 
-    They are not as many as colours, so that pairs repeat late.
+    They are not as many as colors, so that pairs repeat late.
     """
     return _LOOK["dashes"][place % len(_LOOK["dashes"])]
 
 
 def in_light(text: str) -> str:
-    """Returns a text with light colours in place of the variables, for what does not know CSS."""
+    """Returns a text with light colors in place of the variables, for what does not know CSS."""
     return re.sub(r"var\(--([\w-]+)\)", lambda name: LIGHT[name[1]], text)
 
 
@@ -72,7 +72,7 @@ def layer(mark: str, encoding: Spec, **look: Any) -> Spec:
 #: The env steps of a seed, along the bottom.
 STEPS = quantity(
     "env_steps",
-    title="env steps of a seed",
+    title="env steps per seed",
     axis={"labelExpr": "datum.value ? format(datum.value, '~s') : '0'"},
     scale={"nice": False},
 )
@@ -199,8 +199,8 @@ def shown_rows(data: str, *more: Spec) -> Spec:
 
 
 def series(labels: Sequence[str], *, legend: bool = True) -> Spec:
-    """Returns the colours of configurations."""
-    return _by_place(labels, [colour(i) for i in range(len(labels))], legend=legend)
+    """Returns the colors of configurations."""
+    return _by_place(labels, [color(i) for i in range(len(labels))], legend=legend)
 
 
 def dashes(labels: Sequence[str]) -> Spec:

@@ -23,7 +23,7 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         [_rows(findings), *charts.threshold_line(findings, "x")],
         42 * len(results) + 10,
         name="final",
-        title="The return at the end",
+        title="The final return",
         caption=(
             "Points are means over seeds, thick lines their 95 % intervals, and pale bars the "
             "middle eight tenths of the seeds."
@@ -55,7 +55,7 @@ def _rows(findings: Findings) -> charts.Spec:
     tips = charts.tooltip(**{field: (name, ",.4~g") for field, name in said.items()})
     color = charts.series(findings.labels, legend=False)
     scale = {"zero": False, "padding": 12}
-    mean = charts.quantity("value", title="return at the end", scale=scale)
+    mean = charts.quantity("value", title="final return", scale=scale)
     y = {"axis": None, "scale": {"domain": [len(findings.results) - 0.4, -0.6]}}
     tenths = {"x": charts.quantity("tenth"), "x2": {"field": "ninetieth"}}
     interval = {"x": charts.quantity("low"), "x2": {"field": "high"}}

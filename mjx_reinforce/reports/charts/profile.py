@@ -21,7 +21,7 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         return
     returns = np.linspace(finals.min(), finals.max(), _MOST_POINTS)
     shares = [performance_profile(each.final, returns) for each in findings.results]
-    x = charts.quantity("threshold", title="return at the end", scale={"nice": False})
+    x = charts.quantity("threshold", title="final return", scale={"nice": False})
     said = {"threshold": ("return", ",.1f"), "share": ("seeds above", ".1%")}
     lines = charts.share_layers(findings, "profile", x, "seeds above it", said)
     yield charts.make_chart(

@@ -23,7 +23,7 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
             name=data,
             title=said,
             caption="",
-            alt=f"Mean return at the end over {said}; table 1 has the numbers.",
+            alt=f"Mean final return over {said}; table 1 has the numbers.",
             data={data: _means_by_setting(findings, name)},
         )
 
@@ -34,7 +34,7 @@ def _lines(data: str, x: charts.Spec) -> charts.Spec:
     def if_best(one: object, other: object) -> charts.Spec:
         return {"condition": {"test": "datum.best", "value": one}, "value": other}
 
-    title = "mean return at the end"
+    title = "mean final return"
     value = charts.quantity("value", title=title, scale={"zero": False, "padding": 8})
     interval = {"y": charts.quantity("low", title=title), "y2": {"field": "high"}}
     said = {"value": "mean return", "low": "95 % from", "high": "to"}

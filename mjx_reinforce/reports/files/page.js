@@ -182,7 +182,7 @@
     const moment = Number(slider.value);
     const text = moment === moments.length - 1
       ? "the end: the last evaluation of each seed, as in table 1"
-      : `${moments[moment].toLocaleString("en")} env steps of a seed`;
+      : `${moments[moment].toLocaleString("en")} env steps per seed`;
     output.textContent = text;
     slider.setAttribute("aria-valuetext", text);
   };

@@ -22,7 +22,7 @@ from mjx_reinforce.engine.physics.mjx_internals import jax_fields
 ASSETS = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "assets")
 
 # MJX's solver takes XLA long to compile and no time to run: a reference is compiled in half the
-# time without optimisations, and then associates sums as they are written.
+# time without optimizations, and then associates sums as they are written.
 UNOPTIMIZED = {"xla_backend_optimization_level": 0}
 
 CHAIN = (Path(__file__).parent / "chain.xml").read_text("utf-8")

@@ -111,7 +111,7 @@ def test_an_estimator_whose_weights_do_not_fit_is_named(update, message):
 
 
 def test_an_estimator_needs_so_many_episodes():
-    with pytest.raises(ValueError, match="at least 2 episodes an update, got num_episodes=1"):
+    with pytest.raises(ValueError, match="at least 2 episodes per update, got num_episodes=1"):
         check_estimator(m.leave_one_out(0.9), Chain(), 3, 1)
 
 

@@ -57,7 +57,7 @@ def _first_extreme(graph: Graph, row: list, better: str, dtype: np.dtype) -> Any
 
 
 def _sort(graph: Graph, eqn: Equation, *operands: Array) -> Results:
-    """Sorts short arrays by exchanging neighbours, which is stable; NaN comes last."""
+    """Sorts short arrays by exchanging neighbors, which is stable; NaN comes last."""
     axis, num_keys = eqn.params["dimension"], eqn.params["num_keys"]
     columns = [np.moveaxis(arrays.lift(x), axis, -1).copy() for x in operands]
     size = columns[0].shape[-1]
