@@ -16,7 +16,6 @@ from mjx_reinforce.envs.parts import View
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco
-_LEAVE_OUT = "leave --backend mujoco out"
 #: What C MuJoCo warns of where it begins again in the middle of an episode.
 _RESETS = (_C.mjtWarning.mjWARN_BADQPOS, _C.mjtWarning.mjWARN_BADQVEL, _C.mjtWarning.mjWARN_BADQACC)
 
@@ -36,7 +35,7 @@ class _Recorder(View):
     def __getattr__(self, name: str) -> jax.Array:
         shape = getattr(self.sizes, name)
         if not hasattr(shape, "dtype"):
-            raise ValueError(f"the task reads {name}, which is no array of mjData; {_LEAVE_OUT}")
+            raise ValueError(f"the task reads {name}, which is no array of mjData")
         self.read.add(name)
         return jnp.zeros(shape.shape, shape.dtype)
 
@@ -62,9 +61,7 @@ class InMujoco:
             MujocoEnv.reset,
             MujocoEnv.step,
         ):
-            raise ValueError(
-                f"{own.__name__} has steps of its own, which MuJoCo does not know; {_LEAVE_OUT}"
-            )
+            raise ValueError(f"{own.__name__} has steps of its own, which MuJoCo does not know")
         self.env, self.model, self.data = env, env.mj_model, _C.MjData(env.mj_model)
         self._episode, _ = jax.eval_shape(env.draw, jax.random.key(0))
         self._sizes = Simulation(jax.eval_shape(lambda: models.make_data(env.mj_model)))
@@ -133,8 +130,5 @@ class InMujoco:
     def _field(self, name: str) -> np.ndarray:
         shape, value = getattr(self._sizes, name), np.array(getattr(self.data, name))
         if value.size != np.prod(shape.shape, dtype=int):
-            raise ValueError(
-                f"the task reads {name}, whose size in MuJoCo changes from step to step; "
-                f"{_LEAVE_OUT}"
-            )
+            raise ValueError(f"the task reads {name}, whose size in MuJoCo changes")
         return value.reshape(shape.shape).astype(shape.dtype)

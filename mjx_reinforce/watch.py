@@ -3,7 +3,7 @@
 import dataclasses
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -13,7 +13,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.console.streams import heartbeat, silence_alarms
-from mjx_reinforce.export.films import Renderer, Take, gif, import_mujoco, side_by_side, with_sky
+from mjx_reinforce.export.films import Take, gif, import_mujoco, side_by_side, with_sky
 from mjx_reinforce.export.run_files import Run, SeedChoice, Which, choose_seed, read_run
 from mjx_reinforce.files import check_output, write_bytes
 from mjx_reinforce.settings.config import check_named
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 #: Where runs are put that name no other place, see ``runs.directory.choose_directory``.
 RUNS = Path("runs")
 #: Settings that are whole numbers, with the least and the greatest that is accepted.
-_RANGES = (("width", 1, 4096), ("height", 1, 4096), ("episode", 0, 2**31 - 1))
+_RANGES = {"width": (1, 4096), "height": (1, 4096), "episode": (0, 2**31 - 1)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,12 +44,8 @@ class WatchSettings:
     """Seed that plays: best, worst or median by its final evaluation, or a number."""
     which: Which = "last"
     """The policy at the end of training (last), or the best at any evaluation, if it was kept."""
-    beside: Literal["untrained"] | SeedChoice | None = None
-    """A second policy, on the left, from the same start: untrained (before and after), or another
-    seed of the run, such as worst."""
-    backend: Literal["mjx", "mujoco"] | None = None
-    """Simulation that plays: mjx, as in training, or mujoco, C MuJoCo, which starts at once. By
-    default mjx for a run, mujoco for a policy of the package."""
+    beside: Literal["untrained"] | None = None
+    """A second policy, on the left, from the same start: before and after training."""
     episode: int = 0
     """Number of the start state. The same number gives the same start."""
     noise: bool = False
@@ -72,19 +68,6 @@ def main() -> None:
     run_command(WatchSettings, "watch", film)
 
 
-class Role(NamedTuple):
-    """A policy that plays.
-
-    label: what a picture says of it
-    name: what a message says of it
-    player: the policy
-    """
-
-    label: str
-    name: str
-    player: "Player"
-
-
 def film(settings: WatchSettings) -> None:
     """Plays the episode, says what it returned, and writes the film.
 
@@ -99,20 +82,23 @@ def film(settings: WatchSettings) -> None:
     output = film_path(settings, run)
     import_mujoco()
     configure_jax()
-    roles = cast(settings, run)
+    from mjx_reinforce.export.player import load_seed
+
+    player, _ = load_seed(run, settings.seed, settings.which, settings.policy)
+    label = run.env if run.packaged else f"{run.env}, seed {player.seed}"
+    players = {label: player}
+    if settings.beside is not None:
+        players = {"before training": untrained(player), "after training": player}
     env = envs.make_set(run.env, run.env_set)
-    model = scene(env)
-    size = settings.width, settings.height
-    renderer = Renderer(model, *size)  # raises before anything is compiled
-    takes = []
-    for role in roles:
-        name, play = _simulator(settings.backend, env, role.player, run)
+    model, takes = scene(env), []
+    for label, player in players.items():
+        name, play = simulator(env, player, run.horizon)
         with _waiting("compiling and playing"):
             episode = play(settings.episode, settings.noise)
         steps = f"{len(episode.rewards)} steps in {name}"
-        print(f"{run.env}, {role.name}: return {episode.total:.1f} in {steps}")
-        takes.append(Take(role.label, model, _within(env, "dt").dt, *episode))
-    shown = side_by_side(takes, *size, seconds=settings.seconds, renderer=renderer)
+        print(f"{label}: return {episode.total:.1f} in {steps}")
+        takes.append(Take(label, model, _within(env, "dt").dt, *episode))
+    shown = side_by_side(takes, settings.width, settings.height, seconds=settings.seconds)
     samples = [*map(shown.draw, shown.samples)]
     frames = map(shown.draw, track(range(shown.length), "drawing", transient=True))
     write_bytes(output, gif(frames, shown.rate, samples))
@@ -153,42 +139,14 @@ def film_path(settings: WatchSettings, run: Run) -> Path:
     """
     if not 0 < settings.seconds < float("inf"):
         raise ValueError(f"--seconds must be positive and finite, got {settings.seconds}")
-    for name, least, most in _RANGES:
-        value = getattr(settings, name)
-        if not least <= value <= most:
+    for name, (least, most) in _RANGES.items():
+        if not least <= (value := getattr(settings, name)) <= most:
             raise ValueError(f"--{name} must be in [{least}, {most}], got {value}")
     seed = choose_seed(run, settings.seed, settings.which)
     by_default = Path(f"{run.env}.gif") if run.packaged else run.directory / f"seed-{seed}.gif"
     output = settings.output or by_default
     check_output(output, settings.overwrite, ".gif")
     return output
-
-
-def cast(settings: WatchSettings, run: Run) -> list[Role]:
-    """Returns the policies that play, from left to right; the last is the one asked for.
-
-    Args:
-      settings: of the film.
-      run: that of the settings.
-
-    Raises:
-      ValueError: the run has no such seed, or a file is damaged.
-    """
-    from mjx_reinforce.export.player import load_seed
-
-    def role(seed: SeedChoice) -> Role:
-        player, _ = load_seed(run, seed, settings.which, settings.policy)
-        rank = f" ({seed})" if isinstance(seed, str) else ""
-        name = "the package's policy" if run.packaged else f"seed {player.seed}"
-        return Role(f"seed {player.seed}{rank}", name, player)
-
-    main = role(settings.seed)
-    if settings.beside is None:
-        return [main._replace(label=main.player.env)]
-    if settings.beside == "untrained":
-        before = Role("before training", "untrained", untrained(main.player))
-        return [before, main._replace(label="after training")]
-    return [role(settings.beside), main]
 
 
 def untrained(player: "Player") -> "Player":
@@ -203,17 +161,17 @@ def untrained(player: "Player") -> "Player":
     return player._replace(actor=actor)
 
 
-def _simulator(
-    backend: str | None, env: "Environment", player: "Player", run: Run
-) -> tuple[str, Any]:
-    """Returns the name of the simulation that plays, and a ``playing.Simulator``."""
-    from mjx_reinforce import playing
-    from mjx_reinforce.envs.base import MujocoEnv
+def simulator(env: "Environment", player: "Player", horizon: int) -> tuple[str, Any]:
+    """Returns the name of a simulation and a ``playing.Simulator``: C MuJoCo's, if that can play.
 
-    if backend is None:
-        backend = "mujoco" if run.packaged and isinstance(env, MujocoEnv) else "mjx"
-    play = playing.mujoco_simulator if backend == "mujoco" else playing.simulator
-    return backend, play(env, player, run.horizon)
+    It starts at once, where ours is compiled first.
+    """
+    from mjx_reinforce import playing
+
+    try:
+        return "mujoco", playing.mujoco_simulator(env, player, horizon)
+    except Exception:  # of what a task of the user's own asks
+        return "mjx", playing.simulator(env, player, horizon)
 
 
 def _waiting(what: str) -> AbstractContextManager[Any]:

@@ -4,7 +4,7 @@ Two commands in this folder, the first of half a minute on two cores, train it a
 
     python -m mjx_reinforce.train --env my_arm:Arm --output arm --num-episodes 64 \
         --env-steps 2000000
-    python -m mjx_reinforce.watch arm --env my_arm:Arm --backend mujoco
+    python -m mjx_reinforce.watch arm --env my_arm:Arm
 """
 
 from pathlib import Path

@@ -7,7 +7,7 @@ import math
 import os
 import warnings
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -169,7 +169,6 @@ def side_by_side(
     *,
     seconds: float,
     max_rate: float = MAX_RATE,
-    renderer: Renderer | None = None,
 ) -> Film:
     """Returns a film of several takes that begin together; one that ends earlier stands still.
 
@@ -179,7 +178,6 @@ def side_by_side(
       height: of each take (pixels).
       seconds: length at most (simulated s); it ends with the longest take.
       max_rate: frames a second at most.
-      renderer: of the last take's model, where it is open already.
 
     Raises:
       ValueError: there is no take, or no OpenGL.
@@ -189,8 +187,7 @@ def side_by_side(
     dt = max(take.dt for take in takes)
     interval = dt * max(1, math.ceil(1 / (dt * max_rate) - 1e-9))
     lasting = max(min(len(take.qpos) * take.dt, seconds) for take in takes)
-    renderers = [Renderer(take.model, width, height) for take in takes[:-1]]
-    renderers.append(renderer or Renderer(takes[-1].model, width, height))
+    renderers = [Renderer(take.model, width, height) for take in takes]
 
     def draw(frame: int) -> np.ndarray:
         pictures = [
@@ -241,9 +238,7 @@ def _font(size: int) -> Any:
 def gif(
     frames: Iterable[np.ndarray], rate: float, samples: Sequence[np.ndarray], colors: int = _COLORS
 ) -> bytes:
-    """Returns a .gif with one palette: one a picture takes 6 ms.
-
-    What does not change from a picture to the next is transparent, which packs well.
+    """Returns a .gif with one palette: one for each picture takes 6 ms.
 
     Args:
       frames: pictures [height, width, 3] uint8.
@@ -253,25 +248,9 @@ def gif(
     """
     from PIL import Image
 
-    sample = Image.fromarray(np.concatenate(samples))
-    palette = sample.quantize(colors, dither=Image.Dither.NONE)
-    options = {"duration": 1000 / rate, "transparency": colors, "disposal": 1}
-
-    def pictures() -> Iterator[Any]:
-        before = None
-        for frame in frames:
-            image = Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
-            now = np.asarray(image)
-            changed = now if before is None else np.where(now == before, np.uint8(colors), now)
-            before = now
-            picture = Image.fromarray(changed, "P")
-            picture.putpalette(palette.getpalette() or [])
-            picture.info["transparency"] = colors
-            yield picture
-
-    film, drawn = io.BytesIO(), pictures()
-    # To optimize is to look for colors that a picture lacks: it takes four times as long.
-    next(drawn).save(
-        *(film, "GIF"), save_all=True, append_images=drawn, loop=0, optimize=False, **options
-    )
+    sample, dither = Image.fromarray(np.concatenate(samples)), Image.Dither.NONE
+    palette = sample.quantize(colors, dither=dither)
+    drawn = (Image.fromarray(x).quantize(palette=palette, dither=dither) for x in frames)
+    film, looks = io.BytesIO(), {"duration": 1000 / rate, "loop": 0, "optimize": True}
+    next(drawn).save(film, "GIF", save_all=True, append_images=drawn, **looks)
     return film.getvalue()

@@ -148,7 +148,8 @@ class Conductor(Observer[Training]):
         here = [every[number] for number in np.unique(runs.configuration)]
         values = {name: [*dict.fromkeys(say(values[name]) for values in here)] for name in here[0]}
         count = f"{counted(len(here), 'configuration')} of {len(every):,}"
-        said = (f"{setting_in_words(name)} {', '.join(x)}" for name, x in values.items())
+        few = {name: x if len(x) < 5 else (x[0], "...", x[-1]) for name, x in values.items()}
+        said = (f"{setting_in_words(name)} {', '.join(x)}" for name, x in few.items())
         return f"{'; '.join(said)} ({count}, {counted(len(runs.seed), 'run')})"
 
     def _progress(self, driver: Training) -> Progress:

@@ -160,10 +160,8 @@ def test_watch_plays_a_policy_of_the_package(tmp_path):
     command = [sys.executable, "-m", "mjx_reinforce.watch", "InvertedPendulum-v5", *options]
     ran = subprocess.run(command, check=True, capture_output=True, text=True, cwd=tmp_path)
     before, after, frames = (line for line in ran.stdout.splitlines() if line.strip())
-    assert before.startswith("InvertedPendulum-v5, untrained: return ")
-    assert after == (
-        "InvertedPendulum-v5, the package's policy: return 1000.0 in 1000 steps in mujoco"
-    )
+    assert before.startswith("before training: return ")
+    assert after == "after training: return 1000.0 in 1000 steps in mujoco"
     assert frames == "75 frames in InvertedPendulum-v5.gif: 3 of 40 s; --seconds 40 shows all"
     shown = [*pictures(tmp_path / "InvertedPendulum-v5.gif")]
     assert shown[0].shape == (102, 240, 3)

@@ -5,7 +5,6 @@ import io
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -15,10 +14,9 @@ from PIL import Image
 from saved_runs import change_env, make_run
 from toys import Survive
 
-from mjx_reinforce import act, envs, load_policy, playing, watch
+from mjx_reinforce import act, envs, load, load_policy, watch
 from mjx_reinforce.engine.play.rollouts import rollout
 from mjx_reinforce.export import films
-from mjx_reinforce.export.run_files import Run, read_run
 
 
 def watch_run(monkeypatch, *arguments):
@@ -26,34 +24,11 @@ def watch_run(monkeypatch, *arguments):
     watch.main()
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """Returns of seeds 0, 1, 2 are 2, 7, 5."""
-    return read_run(make_run(tmp_path_factory.mktemp("run")))
-
-
-def roles(run, **settings):
-    return watch.cast(watch.WatchSettings(**settings), run)
-
-
-def test_who_plays_is_named_where_there_are_two(run):
-    (alone,) = roles(run, seed=2)
-    assert (alone.label, alone.name, alone.player.seed) == ("CartPole-v1", "seed 2", 2)
-    (alone,) = roles(read_run("Hopper-v5"))
-    assert (alone.label, alone.name) == ("Hopper-v5", "the package's policy")
-    both = roles(run, beside="worst")
-    assert [x.label for x in both] == ["seed 0 (worst)", "seed 1 (best)"]
-    assert [x.name for x in both] == ["seed 0", "seed 1"]
-    assert [x.label for x in roles(run, seed=2, beside=0)] == ["seed 0", "seed 2"]
-
-
-def test_before_training_the_parameters_are_random_and_nothing_is_scaled(run):
-    before, after = roles(run, beside="untrained")
-    assert (before.label, before.name) == ("before training", "untrained")
-    assert (after.label, after.name) == ("after training", "seed 1")
-    first, last = before.player.actor, after.player.actor
+def test_before_training_the_parameters_are_random_and_nothing_is_scaled(tmp_path):
+    player = load(make_run(tmp_path))
+    first, last = watch.untrained(player).actor, player.actor
     assert float(first.normalizer.count) == 0 < float(last.normalizer.count)
-    drawn = after.player.policy.init(jax.random.key(1))
+    drawn = player.policy.init(jax.random.key(1))
     jax.tree.map(np.testing.assert_array_equal, first.params, drawn)
     same = jax.tree.map(lambda x, y: bool(np.all(x == y)), first.params, last.params)
     assert not all(jax.tree.leaves(same))
@@ -61,26 +36,23 @@ def test_before_training_the_parameters_are_random_and_nothing_is_scaled(run):
 
 def test_the_package_has_one_policy_of_a_task(monkeypatch, capsys):
     monkeypatch.setattr(envs, "make", lambda *_: pytest.fail("an environment was built"))
-    for options in (["--seed", "worst"], ["--which", "best"], ["--beside", "2"]):
+    for options in (["--seed", "worst"], ["--which", "best"]):
         with pytest.raises(SystemExit, match="2"):
             watch_run(monkeypatch, "HalfCheetah-v5", *options)
         assert "the package has one policy for HalfCheetah-v5" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("asked", [None, "mjx", "mujoco"])
-def test_which_simulation_plays(monkeypatch, asked):
-    """Where nothing is asked, C MuJoCo if it knows the task: it is the package's policy."""
-    monkeypatch.setattr(playing, "mujoco_simulator", lambda *_: "C")
-    monkeypatch.setattr(playing, "simulator", lambda *_: "MJX")
-    plays = {"mjx": ("mjx", "MJX"), "mujoco": ("mujoco", "C")}
-    for env, packaged, unasked in (
-        (Survive(), True, "mjx"),
-        (Pole(), True, "mujoco"),
-        (Pole(), False, "mjx"),
-    ):
-        run = Run(Path(), "Pole-v0", 9, packaged=packaged)
-        found = watch._simulator(asked, env, None, run)  # pyright: ignore
-        assert found == plays[asked or unasked]
+class Stiff(Pole):
+    """Asks of the simulation what MJX alone has."""
+
+    def outcome(self, before, data, action):
+        return data.qpos.at[0].get(), data._impl is None, {}
+
+
+def test_c_mujoco_plays_what_it_can(tmp_path):
+    player = load(make_run(tmp_path))
+    for env, name in ((Survive(), "mjx"), (Pole(), "mujoco"), (Stiff(), "mjx")):
+        assert watch.simulator(env, player, 9)[0] == name
 
 
 @pytest.mark.slow
@@ -213,8 +185,7 @@ def test_wrapped_environments_are_filmed(tmp_path, monkeypatch):
     """By a wrapper of brax's, which hands on all attributes, and by one's own, which has few."""
     (tmp_path / "wraps.py").write_text(WRAPPERS)
     monkeypatch.syspath_prepend(tmp_path)
-    for module in (watch, films):
-        monkeypatch.setattr(module, "Renderer", Blank)
+    monkeypatch.setattr(films, "Renderer", Blank)
     run = make_run(tmp_path)
     frames = {}
     for name in ("CartPole-v1", "wraps:Plain", "wraps:OfBrax", "wraps:Twice"):
