@@ -21,7 +21,6 @@ from mjx_reinforce.reports.experiment import (
     lengthened,
     settings_in_words,
 )
-from mjx_reinforce.settings.config import read_seeds
 
 #: What config.json says besides the settings.
 PROVENANCE = (
@@ -74,8 +73,6 @@ def read_experiment(sources: Sequence[Path]) -> Experiment:
         )
     joined = _join_shares(found)
     configurations = _told_apart(joined)
-    if any(source.settings.get("seeds") for source in found):
-        _check_seeds(configurations)
     thresholds = [source.threshold for source in found if source.threshold is not None]
     provenance, disagree = _merge_provenance(found)
     timings = sum((Counter(source.timings) for source in found), Counter())
@@ -100,66 +97,44 @@ def _join_shares(sources: Sequence[Source]) -> list[Source]:
     Raises:
       ValueError: shares have a seed in common.
     """
-
-    def trained(source: Source) -> Any:
-        settings = {k: x for k, x in source.settings.items() if k not in _HOUSEKEEPING}
-        return settings, [part.settings for part in source.configurations]
-
-    joined = []
+    alike: dict[str, list[Source]] = {}
     for source in sources:
-        alike = [other for other in sources if trained(other) == trained(source)]
-        if not any(other.settings.get("seeds") for other in alike):
-            joined.append(source)
-        elif source is alike[0]:
-            joined.append(_join(alike))
+        settings = {k: x for k, x in source.settings.items() if k not in _HOUSEKEEPING}
+        trained = settings, [part.settings for part in source.configurations]
+        alike.setdefault(repr(trained), []).append(source)
+    joined = []
+    for shares in alike.values():
+        if any(share.settings.get("seeds") for share in shares):
+            parts = zip(*(share.configurations for share in shares), strict=True)
+            shares = [shares[0]._replace(configurations=[_join_parts(each) for each in parts])]
+        joined += shares
     return joined
-
-
-def _join(shares: Sequence[Source]) -> Source:
-    """Returns shares of one run or sweep as one source."""
-    of_seed: dict[int, Path] = {}
-    for source in shares:
-        for seed in sorted({*np.concatenate([part.seed for part in source.configurations])}):
-            other = of_seed.setdefault(int(seed), source.directory)
-            if other != source.directory:
-                raise ValueError(
-                    f"{other} and {source.directory} both have seed {seed}, with equal settings: "
-                    "give each share other --seeds, or leave one of them out"
-                )
-    parts = zip(*(source.configurations for source in shares), strict=True)
-    return shares[0]._replace(configurations=[_join_parts(each) for each in parts])
 
 
 def _join_parts(parts: Sequence[Configuration]) -> Configuration:
     """Returns one configuration of several shares; seeds that ended earlier repeat their last."""
     length = max(len(part.eval_return) for part in parts)
+    where = [place for part in parts for place in part.where]
+    seed, order, times = np.unique(
+        np.concatenate([part.seed for part in parts]), return_index=True, return_counts=True
+    )
+    if len(order) < len(where):
+        raise ValueError(
+            f"{' and '.join(map(str, dict.fromkeys(where)))} have seed {seed[times.argmax()]} in "
+            "common, with equal settings: give each share other --seeds, or leave one of them out"
+        )
 
     def together(name: str) -> np.ndarray:
         each = [lengthened(getattr(part, name), length) for part in parts]
         return np.concatenate(each, axis=1)[:, order]
 
-    seed = np.concatenate([part.seed for part in parts])
-    order = np.argsort(seed)
-    where = [place for part in parts for place in part.where]
     return parts[0]._replace(
         eval_return=together("eval_return"),
         env_steps=together("env_steps"),
         nonfinite=np.concatenate([part.nonfinite for part in parts])[order],
-        seed=seed[order],
+        seed=seed,
         where=[where[i] for i in order],
     )
-
-
-def _check_seeds(configurations: Sequence[Configuration]) -> None:
-    """Raises ValueError for shares of which no run can be made, and which cannot be compared."""
-    first, *others = configurations
-    for other in others:
-        if not np.intersect1d(first.seed, other.seed).size:
-            one, two = (f"{part.where[0]} ({part.label})" for part in (first, other))
-            raise ValueError(
-                f"{one} and {two} have no seed in common, so they cannot be compared, and their "
-                "settings differ, so they are no shares of one run: give equal --seeds or settings"
-            )
 
 
 def _told_apart(sources: Sequence[Source]) -> list[Configuration]:
@@ -241,15 +216,11 @@ def read_directory(directory: Path) -> Source:
 
 def _read_run(directory: Path, config: dict[str, Any]) -> Source:
     """Reads a run with this config.json."""
-    path, seeds = directory / "summary.json", config.get("seeds")
+    path, columns = directory / "summary.json", read_metrics(directory / "metrics.csv")
     summary: dict[str, Any] = read_json(path) if path.exists() else {"status": "running"}
-    first = read_seeds(seeds).start if isinstance(seeds, str) else 0
-    columns = read_metrics(directory / "metrics.csv", first)
     num_seeds = len(columns["seed"])
     with naming_damage(path):
-        counts = summary.get("nonfinite") or [0] * num_seeds  # a list of events, once
-        check_type("nonfinite", counts, tuple[int, ...])
-        nonfinite = np.array(counts, np.int64)
+        nonfinite = np.array(summary.get("nonfinite", [0] * num_seeds), np.int64)
         outcome = _outcome(summary)
     where = [directory] * num_seeds
     kept = {name: value for name, value in config.items() if name in PROVENANCE}
@@ -309,10 +280,8 @@ def _read_curves(directory: Path) -> dict[str, np.ndarray]:
         return found
 
 
-def read_metrics(path: Path, first: int = 0) -> dict[str, np.ndarray]:
-    """Returns the columns ``env_steps`` and ``eval_return`` of a metrics.csv, and ``seed`` [S].
-
-    The columns are [E, S], of S seeds from ``first`` on.
+def read_metrics(path: Path) -> dict[str, np.ndarray]:
+    """Returns the columns ``env_steps`` and ``eval_return`` [E, S] of a metrics.csv, ``seed`` [S].
 
     A last line or evaluation that is not whole, which a killed run may leave, is left out.
 
@@ -324,9 +293,9 @@ def read_metrics(path: Path, first: int = 0) -> dict[str, np.ndarray]:
     seed = columns["seed"]
     if not len(seed):
         raise ValueError(f"{path} has no evaluation yet; wait for the first, or train again")
-    num_seeds = max(int(seed.max()) - first, 0) + 1
+    num_seeds = len(np.unique(seed))
     whole = len(seed) // num_seeds * num_seeds
-    if not whole or (seed != first + np.arange(len(seed)) % num_seeds).any():
+    if (seed != np.resize(seed[:num_seeds], len(seed))).any():
         raise ValueError(f"{path} is damaged: its lines are not in the order of the seeds")
     shape = (-1, num_seeds)
     found = {name: columns[name][:whole].reshape(shape) for name in ("env_steps", "eval_return")}
