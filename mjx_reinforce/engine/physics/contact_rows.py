@@ -17,11 +17,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from mujoco import mjx
 
 from mjx_reinforce.engine.physics.mjx_internals import geom_groups
-from mjx_reinforce.engine.scalar import by_engine, skippable
+from mjx_reinforce.engine.scalar import is_written_out, short_scan, skippable
 
 Pair = tuple[jax.Array, jax.Array]
 
@@ -44,42 +43,37 @@ class Blocks(NamedTuple):
 
     others: the leading rows, which belong to no contact
     groups: the contacts
-    may_unroll: whether loops over contacts may be written out, see ``scalar.by_engine``
     """
 
     others: int
     groups: tuple[Group, ...]
-    may_unroll: bool
 
 
 class Jacobian(NamedTuple):
     """The rows, and for machine code the bases of the contacts.
 
     rows: [rows, nv]
-    bases: of each group, [contacts, vectors, nv]
+    bases: of each group, [contacts, vectors, nv]; none where XLA compiles
     """
 
     rows: jax.Array
     bases: Sequence[jax.Array]
 
 
-def blocks(
-    others: int, dims: np.ndarray, couplings: Mapping[int, np.ndarray], may_unroll: bool = True
-) -> Blocks:
+def blocks(others: int, dims: np.ndarray, couplings: Mapping[int, np.ndarray]) -> Blocks:
     """Returns the division for contacts [C] of these dimensions under pyramidal cones.
 
     Args:
       others: the rows of no contact, which come first.
       dims: [C]
       couplings: of ``couplings``.
-      may_unroll: see ``scalar.by_engine``.
     """
     groups = tuple(
         Group(int((dims == dim).sum()), _pyramid(dim), coupled)
         for dim, coupled in sorted(couplings.items())
         if (dims == dim).any()
     )
-    return Blocks(others, groups, may_unroll)
+    return Blocks(others, groups)
 
 
 def couplings(model: mjx.Model) -> dict[int, np.ndarray]:
@@ -119,13 +113,8 @@ def with_bases(division: Blocks, rows: jax.Array, touching: jax.Array) -> Jacobi
       rows: [rows, nv]
       touching: [C] whether a contact's rows may be other than zero.
     """
-
-    def whole(rows: jax.Array, touching: jax.Array) -> list[jax.Array]:
-        """Nothing reads them there."""
-        return [
-            jnp.zeros((group.contacts, group.pyramid.shape[1], rows.shape[1]), rows.dtype)
-            for group in division.groups
-        ]
+    if not is_written_out():
+        return Jacobian(rows, [])
 
     def of_group(group: Group, edges: jax.Array, touching: jax.Array) -> jax.Array:
         pyramid = group.pyramid
@@ -136,14 +125,10 @@ def with_bases(division: Blocks, rows: jax.Array, touching: jax.Array) -> Jacobi
             zeros = jnp.zeros((len(inverse), edges.shape[1]), edges.dtype)
             return None, skippable(touches, lambda: inverse @ edges, zeros)
 
-        return lax.scan(basis, None, (edges, touching))[1]
+        return short_scan(basis, None, (edges, touching))[1]
 
-    def by_contact(rows: jax.Array, touching: jax.Array) -> list[jax.Array]:
-        parts = by_group(division, rows), _of_groups(division, touching)
-        return [of_group(*each) for each in zip(division.groups, *parts, strict=True)]
-
-    bases = by_engine(by_contact, whole, rows, touching, may_unroll=division.may_unroll)
-    return Jacobian(rows, bases)
+    parts = by_group(division, rows), _of_groups(division, touching)
+    return Jacobian(rows, [of_group(*each) for each in zip(division.groups, *parts, strict=True)])
 
 
 def weighted(
@@ -158,39 +143,33 @@ def weighted(
       mass: [rows]; where all of a contact's are zero, its forces are zero too.
       force: [rows]
     """
-
-    def whole(start: jax.Array, jacobian: Jacobian, mass: jax.Array, force: jax.Array) -> Pair:
-        rows = jacobian.rows
-        return start + (rows.T * mass) @ rows, rows.T @ force
-
-    def by_contact(start: jax.Array, jacobian: Jacobian, mass: jax.Array, force: jax.Array) -> Pair:
-        others = slice(division.others)
-        sums = whole(start, Jacobian(jacobian.rows[others], []), mass[others], force[others])
-        parts = by_group(division, mass), by_group(division, force)
-        for group, basis, *each in zip(division.groups, jacobian.bases, *parts, strict=True):
-            pyramid = jnp.asarray(group.pyramid, start.dtype)
-
-            def add(
-                sums: tuple, one: tuple, pyramid: jax.Array = pyramid, group: Group = group
-            ) -> tuple[tuple, None]:
-                basis, mass, force = one
-
-                def pushed() -> tuple:
-                    hessian, joint_force = sums
-                    weights = (pyramid.T * mass) @ pyramid @ basis
-                    added = _plus_product(hessian, basis.T[:, None], weights.T[None])
-                    return (
-                        jnp.where(group.coupled, added, hessian),
-                        _plus_product(joint_force, basis.T, pyramid.T @ force),
-                    )
-
-                return skippable(jnp.any(mass != 0), pushed, sums), None
-
-            sums, _ = lax.scan(add, sums, (basis, *each))
+    others = slice(division.others if is_written_out() else None)
+    rows = jacobian.rows[others]
+    sums = start + (rows.T * mass[others]) @ rows, rows.T @ force[others]
+    if not is_written_out():
         return sums
+    parts = by_group(division, mass), by_group(division, force)
+    for group, basis, *each in zip(division.groups, jacobian.bases, *parts, strict=True):
+        pyramid = jnp.asarray(group.pyramid, start.dtype)
 
-    operands = start, jacobian, mass, force
-    return by_engine(by_contact, whole, *operands, may_unroll=division.may_unroll)
+        def add(
+            sums: tuple, one: tuple, pyramid: jax.Array = pyramid, group: Group = group
+        ) -> tuple[tuple, None]:
+            basis, mass, force = one
+
+            def pushed() -> tuple:
+                hessian, joint_force = sums
+                weights = (pyramid.T * mass) @ pyramid @ basis
+                added = _plus_product(hessian, basis.T[:, None], weights.T[None])
+                return (
+                    jnp.where(group.coupled, added, hessian),
+                    _plus_product(joint_force, basis.T, pyramid.T @ force),
+                )
+
+            return skippable(jnp.any(mass != 0), pushed, sums), None
+
+        sums, _ = short_scan(add, sums, (basis, *each))
+    return sums
 
 
 def along(
@@ -204,27 +183,22 @@ def along(
       direction: [nv]
       touching: [C] whether a contact's rows may be other than zero.
     """
-
-    def whole(jacobian: Jacobian, direction: jax.Array, touching: jax.Array) -> jax.Array:
+    if not is_written_out():
         return jacobian.rows @ direction
 
-    def by_contact(jacobian: Jacobian, direction: jax.Array, touching: jax.Array) -> jax.Array:
-        def of_group(group: Group, basis: jax.Array, touching: jax.Array) -> jax.Array:
-            pyramid = jnp.asarray(group.pyramid, direction.dtype)
+    def of_group(group: Group, basis: jax.Array, touching: jax.Array) -> jax.Array:
+        pyramid = jnp.asarray(group.pyramid, direction.dtype)
 
-            def product(_: None, one: tuple) -> tuple[None, jax.Array]:
-                basis, touches = one
-                zeros = jnp.zeros(len(pyramid), pyramid.dtype)
-                return None, skippable(touches, lambda: pyramid @ (basis @ direction), zeros)
+        def product(_: None, one: tuple) -> tuple[None, jax.Array]:
+            basis, touches = one
+            zeros = jnp.zeros(len(pyramid), pyramid.dtype)
+            return None, skippable(touches, lambda: pyramid @ (basis @ direction), zeros)
 
-            return lax.scan(product, None, (basis, touching))[1].reshape(-1)
+        return short_scan(product, None, (basis, touching))[1].reshape(-1)
 
-        others, parts = jacobian.rows[: division.others], _of_groups(division, touching)
-        each = zip(division.groups, jacobian.bases, parts, strict=True)
-        return jnp.concatenate([others @ direction, *(of_group(*one) for one in each)])
-
-    operands = jacobian, direction, touching
-    return by_engine(by_contact, whole, *operands, may_unroll=division.may_unroll)
+    others, parts = jacobian.rows[: division.others], _of_groups(division, touching)
+    each = zip(division.groups, jacobian.bases, parts, strict=True)
+    return jnp.concatenate([others @ direction, *(of_group(*one) for one in each)])
 
 
 def _plus_product(start: jax.Array, left: jax.Array, right: jax.Array) -> jax.Array:

@@ -43,7 +43,7 @@ from mujoco import mjx
 from mjx_reinforce.engine.physics import inertia, mjx_internals
 from mjx_reinforce.engine.physics.mjx_internals import Collision, GeomInfo, collider, make_frame
 from mjx_reinforce.engine.physics.rows import make_constraint
-from mjx_reinforce.engine.scalar import by_engine
+from mjx_reinforce.engine.scalar import is_written_out, short_scan
 
 # What C takes for zero (mjMINVAL); in single precision, what rounding may leave of a zero distance
 # between points a few metres from the origin. Axes that cross, as in a planar Hopper, have that.
@@ -208,11 +208,8 @@ def _closest_along(
 
     ends = half * jnp.asarray([[-1, -1], [1, 1]], axis.dtype)
     steps = jnp.finfo(axis.dtype).nmant
-    ends = by_engine(
-        lambda *_: lax.scan(halve, ends, None, steps)[0],
-        lambda *_: lax.scan(halve, ends, None, steps, unroll=steps)[0],  # see `fenced`
-    )
-    return jnp.mean(ends)
+    unroll = not is_written_out()  # see `fenced`
+    return jnp.mean(lax.scan(halve, ends, None, steps, unroll=unroll)[0])
 
 
 def _above_polygon(
@@ -271,20 +268,13 @@ def one_by_one(collide: Collide) -> Collide:
     """
 
     def together(model: mjx.Model, data: mjx.Data, key: Any, geoms: Any) -> Any:
-        if model.npair:  # pairs have margins of their own
+        if model.npair or not is_written_out():  # pairs have margins of their own
             return collide(model, data, key, geoms)
         first, second = geoms.T
         each = data.geom_xpos, data.geom_xmat, model.geom_size
         spheres = model.geom_rbound[first] + model.geom_rbound[second]
         margins = model.geom_margin[first] + model.geom_margin[second]
-        rows = [jnp.stack([x[first], x[second]], 1) for x in each]
-
-        def all_at_once(*rows: jax.Array) -> Any:
-            return collide(model, data, key, geoms)
-
-        def in_turn(*rows: jax.Array) -> Any:
-            contacts = lax.scan(lambda _, row: (None, pair(*row)), None, rows)[1]
-            return jax.tree.map(jnp.concatenate, contacts)
+        rows = *(jnp.stack([x[first], x[second]], 1) for x in each), spheres, margins
 
         def pair(
             pos: jax.Array, mat: jax.Array, size: jax.Array, spheres: Any, margin: jax.Array
@@ -303,7 +293,8 @@ def one_by_one(collide: Collide) -> Collide:
                 near,
             )
 
-        return by_engine(in_turn, all_at_once, *rows, spheres, margins, may_unroll=True)
+        contacts = short_scan(lambda _, row: (None, pair(*row)), None, rows)[1]
+        return jax.tree.map(jnp.concatenate, contacts)
 
     together.ncon = collide.ncon  # pyright: ignore
     return together

@@ -13,7 +13,7 @@ from mujoco import mjx
 
 from mjx_reinforce.engine.physics import mjx_internals
 from mjx_reinforce.engine.physics.mjx_internals import advance, jax_fields, with_fields
-from mjx_reinforce.engine.scalar import by_engine
+from mjx_reinforce.engine.scalar import is_written_out
 
 
 def tendon_armature(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -43,21 +43,17 @@ def inverse_times(model: mjx.Model, data: mjx.Data, force: jax.Array) -> jax.Arr
       data: its data after ``mjx.factor_m``.
       force: [nv]
     """
-    return by_engine(
-        lambda: _from_leaves(mjx.full_m(model, data), force),
-        lambda: mjx_internals.solve_m(model, data, force),
-    )
+    if not is_written_out():
+        return mjx_internals.solve_m(model, data, force)
+    return _from_leaves(mjx.full_m(model, data), force)
 
 
 def fwd_acceleration(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Computes the acceleration without constraints, as ``mjx.fwd_acceleration``."""
     data = mjx.fwd_acceleration(model, data)
-    return data.replace(
-        qacc_smooth=by_engine(
-            lambda: _from_leaves(mjx.full_m(model, data), data.qfrc_smooth),
-            lambda: data.qacc_smooth,
-        )
-    )
+    if not is_written_out():
+        return data
+    return data.replace(qacc_smooth=inverse_times(model, data, data.qfrc_smooth))
 
 
 def euler(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -192,14 +188,16 @@ def _inverse(matrix: jax.Array) -> jax.Array:
 
 def solve(matrix: jax.Array, force: jax.Array) -> jax.Array:
     """Returns inv(matrix) force, [nv], for an inertia matrix to which a positive one was added."""
-
-    def whole() -> jax.Array:  # as MJX, where its matrices are dense
-        return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix, lower=True), force)
-
-    return by_engine(lambda: _from_leaves(matrix, force), whole)
+    if is_written_out():
+        return _from_leaves(matrix, force)
+    return _from_root(matrix, force)  # as MJX, where its matrices are dense
 
 
 def _from_leaves(inertia: jax.Array, force: jax.Array) -> jax.Array:
     """Solves; the degrees of freedom [nv] of a body come after those of its parent."""
-    factor = jax.scipy.linalg.cho_factor(inertia[::-1, ::-1], lower=True)
-    return jax.scipy.linalg.cho_solve(factor, force[::-1])[::-1]
+    return _from_root(inertia[::-1, ::-1], force[::-1])[::-1]
+
+
+def _from_root(inertia: jax.Array, force: jax.Array) -> jax.Array:
+    factor = jax.scipy.linalg.cho_factor(inertia, lower=True)
+    return jax.scipy.linalg.cho_solve(factor, force)

@@ -126,9 +126,7 @@ def supports(model: mjx.Model, data: mjx.Data) -> bool:
     )
 
 
-def solve_newton(
-    model: mjx.Model, data: mjx.Data, may_unroll: bool = True
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+def solve_newton(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Finds the acceleration under constraints, from the start that costs less.
 
     The starts are the unconstrained acceleration and, unless the model disables it, the warm start.
@@ -137,7 +135,6 @@ def solve_newton(
       model: a model that ``supports`` accepts; ``iterations`` and ``ls_iterations`` bound the
         loops.
       data: with its constraint rows made.
-      may_unroll: whether loops over contacts may be written out, see ``scalar.by_engine``.
 
     Returns:
       The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
@@ -146,7 +143,7 @@ def solve_newton(
     equality = jnp.arange(fields.efc_D.shape[0]) < fields.ne
     num_others = fields.ne + fields.nf + fields.nl
     coupled = contact_rows.couplings(model)
-    division = contact_rows.blocks(num_others, fields.contact.dim, coupled, may_unroll)
+    division = contact_rows.blocks(num_others, fields.contact.dim, coupled)
     # A NaN counts as touching, so that it gets to the acceleration.
     touching = ~(fields.contact.dist - fields.contact.includemargin >= 0)
     jacobian = contact_rows.with_bases(division, fields.efc_J, touching)

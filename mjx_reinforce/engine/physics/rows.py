@@ -17,7 +17,7 @@ from mujoco import mjx
 
 from mjx_reinforce.engine.physics import mjx_internals
 from mjx_reinforce.engine.physics.mjx_internals import jax_fields, rows_of, with_contact, with_rows
-from mjx_reinforce.engine.scalar import by_engine
+from mjx_reinforce.engine.scalar import is_written_out, short_scan
 
 _NO_OTHERS = mjx.DisableBit.EQUALITY | mjx.DisableBit.FRICTIONLOSS | mjx.DisableBit.LIMIT
 _NO_EQUALITY = mjx.DisableBit.EQUALITY | mjx.DisableBit.CONSTRAINT
@@ -25,26 +25,22 @@ _NO_EQUALITY = mjx.DisableBit.EQUALITY | mjx.DisableBit.CONSTRAINT
 _FIRST = {mjx.EqType.CONNECT: 3, mjx.EqType.WELD: 6}
 
 
-def make_constraint(model: mjx.Model, data: mjx.Data, may_unroll: bool = True) -> mjx.Data:
+def make_constraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Makes the constraint rows, as ``mjx.make_constraint``, with the exception above.
 
     Of a contact that does not touch only the Jacobian and the reference, both zero, are right.
-    ``may_unroll`` is that of loops over contacts, see ``scalar.by_engine``.
     """
     contact = jax_fields(data).contact
-    if model.opt.disableflags & mjx.DisableBit.CONSTRAINT or not contact.dim.size:
+    none = model.opt.disableflags & mjx.DisableBit.CONSTRAINT or not contact.dim.size
+    if none or not is_written_out():
         return _with_changes(model, mjx.make_constraint(model, data))
 
-    def in_turn() -> list[jax.Array]:
-        parts = [rows_of(mjx.make_constraint(model, with_contact(data, contact, np.zeros(0, int))))]
-        for dim in (1, 3, 4, 6):
-            chosen = np.flatnonzero(contact.dim == dim)
-            if chosen.size:
-                parts.append(_contact_rows(model, data, int(dim), chosen))
-        return [jnp.concatenate(part) for part in zip(*parts, strict=True)]
-
-    whole = lambda: rows_of(mjx.make_constraint(model, data))  # noqa: E731
-    rows = by_engine(in_turn, whole, may_unroll=may_unroll)
+    parts = [rows_of(mjx.make_constraint(model, with_contact(data, contact, np.zeros(0, int))))]
+    for dim in (1, 3, 4, 6):
+        chosen = np.flatnonzero(contact.dim == dim)
+        if chosen.size:
+            parts.append(_contact_rows(model, data, int(dim), chosen))
+    rows = [jnp.concatenate(part) for part in zip(*parts, strict=True)]
     return _with_changes(model, with_rows(data, rows))
 
 
@@ -100,5 +96,5 @@ def _contact_rows(model: mjx.Model, data: mjx.Data, dim: int, chosen: np.ndarray
         )
 
     contacts = jax.tree.map(lambda x: x[chosen], contact)
-    rows = lax.scan(make, None, contacts)[1]
+    rows = short_scan(make, None, contacts)[1]
     return [x.reshape(-1, *x.shape[2:]) for x in rows]

@@ -6,6 +6,7 @@ of each that touches in any of them. So each episode's own are brought together 
 would compute both sides of every branch, solves with the rows of all contacts.
 """
 
+import contextlib
 import math
 from collections.abc import Callable
 from typing import Any
@@ -19,11 +20,11 @@ from mujoco import mjx
 from mjx_reinforce.engine.physics.mjx_internals import jax_fields, with_contact
 from mjx_reinforce.engine.physics.newton import solve_in_loops
 from mjx_reinforce.engine.physics.rows import make_constraint
-from mjx_reinforce.engine.scalar import by_engine
+from mjx_reinforce.engine.scalar import is_written_out, writing_out
 
 #: Acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
 Solution = tuple[jax.Array, jax.Array, jax.Array]
-#: (model, data with rows, whether loops over contacts may be written out) -> solution
+#: (model, data with rows) -> solution
 Solver = Callable[..., Solution]
 #: Loops over more contacts are not written out, whatever the engine.
 _UNROLLABLE = 6
@@ -47,11 +48,9 @@ def solve_touching(solver: Solver, model: mjx.Model, data: mjx.Data) -> Solution
     kinds = [k for dim in (1, 3, 4, 6) if (k := np.flatnonzero(contact.dim == dim)).size]
     room, rows = _room(model), jax_fields(data).efc_D.size
     saved = sum(_rows_of_one(contact, kind) * max(0, kind.size - room) for kind in kinds)
-    if 2 * saved < rows:
+    if 2 * saved < rows or not is_written_out():
         return solver(model, data)
-    return by_engine(
-        lambda: _with_few(solver, model, data, kinds, room), lambda: solver(model, data)
-    )
+    return _with_few(solver, model, data, kinds, room)
 
 
 def _room(model: mjx.Model) -> int:
@@ -69,7 +68,6 @@ def _with_few(
     """Solves; the kinds are the numbers of the contacts of each dimension."""
     contact = jax_fields(data).contact
     touching = ~(contact.dist - contact.includemargin >= 0)  # a NaN counts as touching
-    may_unroll = room <= _UNROLLABLE
     num_others = jax_fields(data).efc_D.size - sum(_rows_of_one(contact, k) * k.size for k in kinds)
 
     def few() -> Solution:
@@ -77,10 +75,9 @@ def _with_few(
             lambda *x: jnp.concatenate(x), *(contacts for contacts, _ in packed)
         )
         dims = [np.full(min(k.size, room), contact.dim[k[0]]) for k in kinds]
-        ready = make_constraint(
-            model, with_contact(data, together, np.concatenate(dims)), may_unroll
-        )
-        qacc, joint_force, force = solver(model, ready, may_unroll)
+        with contextlib.nullcontext() if room <= _UNROLLABLE else writing_out():
+            packed_data = with_contact(data, together, np.concatenate(dims))
+            qacc, joint_force, force = solver(model, make_constraint(model, packed_data))
         parts, first = [force[:num_others]], num_others
         for kind in kinds:
             size = _rows_of_one(contact, kind)
@@ -90,7 +87,8 @@ def _with_few(
         return qacc, joint_force, jnp.concatenate(parts)
 
     def every() -> Solution:
-        return solve_in_loops(model, make_constraint(model, data, False))
+        with writing_out():
+            return solve_in_loops(model, make_constraint(model, data))
 
     def packed_kind(kind: np.ndarray) -> tuple[Any, jax.Array]:
         return _pack(jax.tree.map(lambda x: x[kind], contact), touching[kind], room)

@@ -21,7 +21,7 @@ from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory
 from mjx_reinforce.engine.checks import check_count, check_key, check_name, check_parts
 from mjx_reinforce.engine.contract import check_policy
 from mjx_reinforce.engine.play import available, native, program, rollouts
-from mjx_reinforce.engine.scalar import jaxprs, size
+from mjx_reinforce.engine.scalar import scalarized, size
 from mjx_reinforce.engine.scalar.vmap import MAX_OPERATIONS
 from mjx_reinforce.engine.team import program as team
 
@@ -188,7 +188,7 @@ def _in_scalars(
     function: Callable[..., Any], *examples: PyTree
 ) -> tuple[str, str, Callable[..., Any]] | None:
     """Returns a function that is small enough for XLA's kernels on a GPU, written out for them."""
-    if size.num_scalars(jaxprs.trace(function, *examples)[0]) >= _SMALL:
+    if size.num_scalars(scalarized.trace(function, *examples)[0]) >= _SMALL:
         return None
     # On a GPU a real branch makes the host wait for its predicate: both sides are computed.
     mapped = scalar.vmap(function, branch_cost=MAX_OPERATIONS)

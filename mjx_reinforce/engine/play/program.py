@@ -17,19 +17,18 @@ from mjx_reinforce.engine.cpu import seam as cpu_seam
 from mjx_reinforce.engine.gpu import kernel as gpu_kernel
 from mjx_reinforce.engine.gpu import lockstep, ptx
 from mjx_reinforce.engine.gpu import seam as gpu_seam
-from mjx_reinforce.engine.play import available, episode, objects, units
+from mjx_reinforce.engine.play import available, episode, objects
 from mjx_reinforce.engine.play.counter import at_counter, split
 from mjx_reinforce.engine.scalar import jaxprs, scalarized
-from mjx_reinforce.engine.scalar.graph import Limits
 from mjx_reinforce.engine.team import kernel as team_kernel
 from mjx_reinforce.engine.team import program as team
 
 #: A branch of more scalar operations is skipped where no lane needs it.
 BRANCH_COST = 40
-#: Loops stay loops: the Runge-Kutta stages too, which are a scan of four.
-LOOPS = Limits(scans=1, unrollable=1)
-#: On GPUs a loop over few contacts is written out: an array that a loop reads is in memory there.
-GPU_LOOPS = LOOPS._replace(unrollable=25)
+#: Up to which length scans are written out: the Runge-Kutta stages, which are four, stay a loop.
+SCANS = 1
+#: For a thread of a GPU loops over few contacts are, too: what a loop reads is in memory there.
+_GPU_SCANS = 25
 #: The folders whose files decide what is written for a step.
 _WRITERS = ("mjx_reinforce.engine",)
 
@@ -85,10 +84,9 @@ def step_function(
         keys = lax.cond(at == 0, lambda keys: split(keys[0]), lambda keys: keys, carried.keys)
         offset = (at * words).astype(jnp.uint32)
         noise = distribution.noise(at_counter(keys[1], offset), ())
-        with units.one_at_a_time():
-            played = episode.step(
-                env.step, act, distribution, actor, state, noise, alive, deterministic != 0
-            )
+        played = episode.step(
+            env.step, act, distribution, actor, state, noise, alive, deterministic != 0
+        )
         after = jax.tree.leaves(episode.hold(alive, played.state, state))
         return StepResult(
             record=[played.observation, played.action, played.reward],
@@ -205,13 +203,14 @@ def load(
     if not on_cpu and (found := _by_teams(use, env, function, examples, writers)):
         return found
     target = machine.this_machine() if on_cpu else None
-    traced, shapes = jaxprs.trace(function, *examples)
+    unrolled = SCANS if target else _GPU_SCANS
+    traced, shapes = scalarized.trace(function, *examples, unrolled=unrolled)
     source = f"{use} {jaxprs.fingerprint(traced)} {objects.source_digest(*_WRITERS)}"
 
     def write() -> str:
         if env is not None:
             available.check_seconds(env, traced, observation_size(env))
-        written = _written(function, examples, LOOPS if target else GPU_LOOPS)
+        written = scalarized.build(traced, shapes, BRANCH_COST, SCANS)
         title = f"; {name}, {lockstep.operations(written.schedule):,} scalar operations\n"
         return title + (writers.cpu(written, target) if target else writers.gpu(written))
 
@@ -219,13 +218,6 @@ def load(
         return machine.load_module(source, write, handler.NAMES, target, objects.folder()), shapes
     capability = gpu_seam.compute_capability()
     return ptx.load_kernel(source, write, capability, objects.folder()), shapes
-
-
-def _written(
-    function: Callable[..., Any], examples: Sequence[PyTree], limits: Limits
-) -> scalarized.Scalarized:
-    varying = [True] * len(jax.tree.leaves(examples))
-    return scalarized.build(function, examples, varying, BRANCH_COST, limits)
 
 
 def _by_teams(
@@ -237,14 +229,15 @@ def _by_teams(
 
     with base.keeping_whole():
         try:
-            traced, shapes = jaxprs.trace(function, *examples)
+            traced, shapes = scalarized.trace(function, *examples)
             if {*scalar.owners(traced)} != {hex(id(team.innermost(env)))}:
                 return None
             physics = team.physics_of(env)
             source = f"{jaxprs.fingerprint(traced)} {physics} {objects.source_digest(*_WRITERS)}"
 
             def write() -> str:
-                return writers.team(_written(function, examples, LOOPS), physics)
+                written = scalarized.build(traced, shapes, BRANCH_COST, SCANS)
+                return writers.team(written, physics)
 
             capability = gpu_seam.compute_capability()
             return ptx.load_kernel(f"{use} {source}", write, capability, objects.folder()), shapes

@@ -4,38 +4,25 @@ Written out, a network of 64 and 64 units would be a program of 9,000 operations
 units of a layer it is short. A network that can compute itself so asks ``wanted`` first.
 """
 
-import contextlib
-import contextvars
 import functools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from mjx_reinforce.engine.base import is_kept_whole
-from mjx_reinforce.engine.scalar import whole
+from mjx_reinforce.engine.scalar import is_written_out, whole
 
 #: Units of one iteration. Their activations do not wait for each other, and the sums of the next
 #: layer stay in registers from one to the next.
 _UNITS_AT_ONCE = 4
-_WANTED = contextvars.ContextVar("one unit at a time", default=False)
-
-
-@contextlib.contextmanager
-def one_at_a_time() -> Iterator[None]:
-    """Has networks that are traced within compute themselves by ``tanh_network``."""
-    token = _WANTED.set(True)
-    try:
-        yield
-    finally:
-        _WANTED.reset(token)
 
 
 def wanted(observation: jax.Array) -> bool:
     """Returns whether a network of one observation [O] is to compute itself by ``tanh_network``."""
-    return _WANTED.get() and observation.ndim == 1
+    return is_written_out() and observation.ndim == 1
 
 
 def tanh_network(layers: Sequence[Mapping[str, jax.Array]], x: jax.Array) -> jax.Array:

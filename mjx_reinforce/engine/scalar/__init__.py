@@ -20,8 +20,8 @@ What to know before using it:
 - Differentiation works where JAX's does: not in reverse through a ``while``. Rules of
   ``jax.custom_jvp`` and ``jax.custom_vjp`` are not kept; the function itself is differentiated.
 - ``lax.platform_dependent`` takes its default: what is written out does not depend on where it
-  runs. ``by_engine`` gives a program for what is written out beside the one for XLA, and of what
-  is ``skippable`` no lane's own result is selected.
+  runs. ``is_written_out`` tells a function whether it is traced for that or for XLA, and of what is
+  ``skippable`` no lane's own result is selected.
 - A primitive without a rule raises ``UnsupportedPrimitive``, which names the line it came from.
   Typed PRNG keys and ``lax.platform_dependent`` without a default raise it too.
 
@@ -41,10 +41,12 @@ So ``(x - x) == 0`` is true for every x; ``jnp.isfinite`` is what tells whether 
 from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive as UnsupportedPrimitive
 from mjx_reinforce.engine.scalar.jaxprs import prune as prune
 from mjx_reinforce.engine.scalar.primitives import any_lane as any_lane
-from mjx_reinforce.engine.scalar.primitives import by_engine as by_engine
+from mjx_reinforce.engine.scalar.primitives import is_written_out as is_written_out
 from mjx_reinforce.engine.scalar.primitives import owners as owners
+from mjx_reinforce.engine.scalar.primitives import short_scan as short_scan
 from mjx_reinforce.engine.scalar.primitives import skippable as skippable
 from mjx_reinforce.engine.scalar.primitives import whole as whole
+from mjx_reinforce.engine.scalar.primitives import writing_out as writing_out
 from mjx_reinforce.engine.scalar.scalarized import Scalarized as Scalarized
 from mjx_reinforce.engine.scalar.scalarized import refusal as refusal
 from mjx_reinforce.engine.scalar.scalarized import scalarize as scalarize

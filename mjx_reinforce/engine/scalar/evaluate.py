@@ -18,7 +18,6 @@ _CONTROL = {
     "scan": loops.scan_rule,
     "cond": loops.cond_rule,
     "skippable": loops.skippable_rule,
-    "by_engine": loops.by_engine_rule,
     "whole": loops.whole_rule,
 }
 
@@ -28,7 +27,6 @@ def run(
     program: jaxprs.Program,
     args: list[np.ndarray],
     used: list[bool] | None = None,
-    may_unroll: bool = False,
 ) -> list[np.ndarray]:
     """Returns a program's outputs.
 
@@ -37,7 +35,6 @@ def run(
       program: what is evaluated.
       args: its arguments.
       used: which of its outputs are; others are zeros, and nothing is computed for them.
-      may_unroll: whether its scans may be written out; see ``by_engine``.
     """
     jaxpr = program.jaxpr
     used = [True] * len(jaxpr.outvars) if used is None else used
@@ -49,7 +46,6 @@ def run(
         return jaxprs.literal_value(atom) if jaxprs.is_literal(atom) else values[atom]
 
     for eqn, needed in jaxprs.live_equations(jaxpr, used):
-        graph.may_unroll = may_unroll  # of this equation; programs inside have their own
         results = _apply(graph, eqn, needed, [read(atom) for atom in eqn.invars])
         values.update(zip(eqn.outvars, results, strict=True))
     return [
@@ -74,7 +70,7 @@ def _apply(
     program = jaxprs.callee(eqn)
     if program is not None:
         with graph.evaluating(eqn):
-            return run(graph, program, operands, used, graph.may_unroll)
+            return run(graph, program, operands, used)
     makes_keys = any(is_key(out.aval) for out in eqn.outvars)
     if all(map(arrays.is_numeric, operands)) and not makes_keys:
         return jaxprs.compute_constants(eqn.primitive.bind, eqn.params, operands)

@@ -7,7 +7,7 @@ out of a branch, because then it would run also where the branch is skipped.
 
 from collections.abc import Hashable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -16,21 +16,6 @@ from mjx_reinforce.engine.scalar import arrays, jaxprs, nodes
 from mjx_reinforce.engine.scalar.nodes import Node, Op, Scalar, Scope
 from mjx_reinforce.engine.scalar.passes import simplify
 from mjx_reinforce.engine.scalar.size import MAX_SCALARS, TooLarge
-
-
-class Limits(NamedTuple):
-    """Up to which length a scan is written out.
-
-    Constants fold iteration by iteration in a scan that is written out, and a loop is shorter. A
-    scan whose own ``unroll`` is its whole length is always written out, as JAX does.
-
-    scans: of any scan.
-    unrollable: of one for which ``by_engine`` says that it may be, instead of the former.
-    """
-
-    scans: int = 4
-    unrollable: int = 4
-
 
 #: ``size`` foresees what is written; where it errs, writing ends here.
 _MOST = 3 * MAX_SCALARS
@@ -41,8 +26,9 @@ class Graph:
 
     branch_cost: a branch of more scalar operations than this is skipped where no element of
       the batch needs it.
-    limits: up to which length scans are written out.
-    may_unroll: whether ``limits.unrollable`` is that of a scan that is evaluated now.
+    scans: up to which length scans are written out. Constants fold iteration by iteration in a scan
+      that is written out, and a loop is shorter. A scan whose own ``unroll`` is its whole length is
+      always written out, as JAX does.
     path: the equations that are being evaluated, from the outermost one, by their ids.
     learned: what was found out on a path. The body of a loop is evaluated again and again, each
       time with less assumed of what never changes, and what was found out inside still holds.
@@ -51,10 +37,9 @@ class Graph:
       if each of them is true for at least one element of the batch.
     """
 
-    def __init__(self, branch_cost: int, limits: Limits):
+    def __init__(self, branch_cost: int, scans: int):
         self.branch_cost = branch_cost
-        self.limits = limits
-        self.may_unroll = False
+        self.scans = scans
         self.path: tuple[int, ...] = ()
         self.learned: dict[Hashable, Any] = {}
         self._evaluated: dict[int, Any] = {}  # kept, so that no id is given twice

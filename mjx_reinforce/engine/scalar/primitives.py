@@ -1,8 +1,7 @@
-"""What a function says to be written out as: ``by_engine``, ``skippable``, ``whole``, ``any_lane``.
+"""What a function says to be written out as: ``skippable``, ``whole``, ``any_lane``.
 
-``by_engine`` has one result computed in two ways. The choice is a primitive of our own, which
-carries both programs. XLA compiles ``many`` and never sees ``one``; ``scalar`` writes ``one`` out.
-No other code chooses between the two.
+Where one episode is best computed in another way than many, a function asks ``is_written_out``
+while it is traced: whoever writes it out traces it within ``writing_out``.
 
 ``skippable`` is a computation that changes nothing where it is not needed. ``scalar`` writes it out
 as a branch that is skipped if no lane needs it. Of ``jax.lax.cond`` it also selects each lane's own
@@ -13,6 +12,7 @@ lane does not need it.
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import jax
@@ -20,130 +20,38 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import batching
 
 from mjx_reinforce.engine.base import PyTree
 from mjx_reinforce.engine.scalar import jaxprs
 
-#: Its operands are those of both programs, which read what they need of them.
-_CHOICE = core.Primitive("by_engine")
-_CHOICE.multiple_results = True
+#: Up to which length a ``short_scan`` is written out, None where XLA compiles. JAX keeps what it
+#: traced with one value of this apart from what it traced with another.
+_UNROLLED = jax.make_user_context(None)
 
 
-def by_engine(one: Callable, many: Callable, *args: PyTree, may_unroll: bool = False) -> Any:
-    """Computes ``many`` where XLA compiles it, and ``one`` where ``scalar`` writes it out.
-
-    The derivative is that of ``many``, for all engines.
+def writing_out(unrolled: int = 1) -> AbstractContextManager[None]:
+    """Has what is traced within take the ways of what is written out.
 
     Args:
-      one: best where an episode takes its own branches.
-      many: best where many episodes are computed at once; it returns the same.
-      *args: arguments of both.
-      may_unroll: whether the scans of ``one`` may be written out, those outside of its loops and
-        branches. Up to which length they are is the engine's ``Limits.unrollable``.
-
-    Raises:
-      TypeError: the results of ``one`` and ``many`` differ in structure, shape or dtype.
+      unrolled: up to which length a ``short_scan`` is written out.
     """
-    if not isinstance(jax.numpy.zeros(()), jax.core.Tracer):  # nothing is traced: XLA computes now
-        return many(*args)
-    leaves, tree = jax.tree.flatten(args)
-    (first, shapes), (second, others) = (
-        jaxprs.trace(lambda *flat, f=f: f(*tree.unflatten(flat)), *leaves) for f in (one, many)
-    )
-    if _signature(shapes) != _signature(others):
-        raise TypeError(f"by_engine got two different results, {shapes} and {others}")
-    consts = [*first.consts, *second.consts]
-    start, end = len(first.consts), len(consts)
-    operands = [*consts, *leaves]
-    results = _CHOICE.bind(
-        *operands,
-        one=_without_consts(first.jaxpr, slice(0, start), end, operands),
-        many=_without_consts(second.jaxpr, slice(start, end), end, operands),
-        may_unroll=may_unroll,
-    )
-    return jax.tree.structure(shapes).unflatten(results)
+    return _UNROLLED(unrolled)
 
 
-def _signature(shapes: Any) -> tuple[Any, list[tuple]]:
-    leaves, tree = jax.tree.flatten(shapes)
-    return tree, [(leaf.shape, np.dtype(leaf.dtype)) for leaf in leaves]
+def is_written_out() -> bool:
+    """Returns whether what is traced now is written out, and not compiled by XLA."""
+    return _UNROLLED.value is not None
 
 
-def _without_consts(jaxpr: Any, consts: slice, end: int, operands: Sequence[Any]) -> Any:
-    """Returns a program of all operands, of which the first ``end`` are constants of programs."""
-    return jax.make_jaxpr(lambda *xs: jax.core.eval_jaxpr(jaxpr, xs[consts], *xs[end:]))(*operands)
+def short_scan(step: Callable, init: PyTree, xs: PyTree) -> Any:
+    """``lax.scan`` of what is written out; up to a length that the engine chooses, no loop is."""
+    length = len(jax.tree.leaves(xs)[0])
+    return jax.lax.scan(step, init, xs, unroll=length <= (_UNROLLED.value or 0))
 
 
-def _many(*operands: PyTree, many: Any, **_: Any) -> list[Any]:
-    return core.jaxpr_as_fun(many)(*operands)
-
-
-def _batched(operands: Sequence[Any], axes: Sequence[int | None], **params: Any) -> tuple:
-    """Maps both programs; a result that depends on nothing mapped stays as it is."""
-    mapped = [axis is not None for axis in axes]
-    one, many = params["one"], params["many"]
-    spread = np.any([_unmapped(one, mapped), jaxprs.depends(many, mapped)], axis=0)
-    out_axes = [0 if wide else None for wide in spread]
-    results = _CHOICE.bind(
-        *operands,
-        one=_Mapped(one, tuple(axes), out_axes, list(map(jax.typeof, operands))),
-        many=jax.make_jaxpr(jax.vmap(core.jaxpr_as_fun(many), tuple(axes), out_axes))(*operands),
-        may_unroll=params["may_unroll"],
-    )
-    return results, out_axes
-
-
-class _Mapped:
-    """A program mapped over one axis more; traced when it is first read, which XLA never does.
-
-    It is read as a closed jaxpr is.
-    """
-
-    def __init__(self, program: Any, axes: tuple, out_axes: list, shapes: list[Any]):
-        self.program, self._axes, self._out_axes, self._shapes = program, axes, out_axes, shapes
-
-    @functools.cached_property
-    def _traced(self) -> Any:
-        """The closed jaxpr."""
-        program = self.program._traced if isinstance(self.program, _Mapped) else self.program
-        mapped = jax.vmap(core.jaxpr_as_fun(program), self._axes, self._out_axes)
-        return jax.make_jaxpr(mapped)(*self._shapes)
-
-    @property
-    def jaxpr(self) -> Any:
-        """Its equations."""
-        return self._traced.jaxpr
-
-    @property
-    def consts(self) -> list[Any]:
-        """The values of its constant variables."""
-        return self._traced.consts
-
-    def __repr__(self) -> str:
-        return repr(self._traced)
-
-
-def _unmapped(program: Any, given: Sequence[bool]) -> list[bool]:
-    """Returns ``jaxprs.depends``, which mapping does not change, without reading what is mapped."""
-    while isinstance(program, _Mapped):
-        program = program.program
-    return jaxprs.depends(program, given)
-
-
-def _derivative(primals: Sequence[Any], tangents: Sequence[Any], *, many: Any, **_: Any) -> Any:
-    filled = tuple(map(ad.instantiate_zeros, tangents))
-    return jax.jvp(core.jaxpr_as_fun(many), tuple(primals), filled)
-
-
-_CHOICE.def_impl(_many)
-_CHOICE.def_abstract_eval(lambda *_, many, **__: many.out_avals)
-batching.primitive_batchers[_CHOICE] = _batched
-ad.primitive_jvps[_CHOICE] = _derivative
-mlir.register_lowering(_CHOICE, mlir.lower_fun(_many, multiple_results=True))
-
-
-#: Its operands are the predicate, the leaves of ``otherwise``, and what the computation reads.
+#: Traced where it is written out. Its operands are the predicate, the leaves of ``otherwise``, and
+#: what the computation reads.
 _SKIPPABLE = core.Primitive("skippable")
 _SKIPPABLE.multiple_results = True
 
@@ -156,6 +64,8 @@ def skippable(needed: jax.Array, compute: Callable[[], PyTree], otherwise: PyTre
       compute: no arguments -> a result of the structure, shapes and dtypes of ``otherwise``.
       otherwise: the result where it is not needed.
     """
+    if not is_written_out():
+        return jax.lax.cond(needed, compute, lambda: otherwise)
     leaves, tree = jax.tree.flatten(otherwise)
     program, _ = jaxprs.trace(lambda: jax.tree.leaves(compute()))
     computation = jax.make_jaxpr(lambda *xs: jax.core.eval_jaxpr(program.jaxpr, xs))(
@@ -177,10 +87,8 @@ def _batched_skippable(operands: Sequence[Any], axes: Sequence[int | None], **pa
     return results, [0] * len(results)
 
 
-_SKIPPABLE.def_impl(_plain_skippable)
 _SKIPPABLE.def_abstract_eval(lambda *_, computation, **__: computation.out_avals)
 batching.primitive_batchers[_SKIPPABLE] = _batched_skippable
-mlir.register_lowering(_SKIPPABLE, mlir.lower_fun(_plain_skippable, multiple_results=True))
 
 
 #: Its operands are those of the operation; it is traced only for backends that know it.

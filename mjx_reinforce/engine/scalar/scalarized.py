@@ -12,9 +12,10 @@ from mjx_reinforce.engine.base import PyTree, is_key
 from mjx_reinforce.engine.checks import explain
 from mjx_reinforce.engine.scalar import arrays, evaluate, jaxprs, size
 from mjx_reinforce.engine.scalar.backend import Backend
-from mjx_reinforce.engine.scalar.graph import Graph, Limits
+from mjx_reinforce.engine.scalar.graph import Graph
 from mjx_reinforce.engine.scalar.nodes import Scalar
 from mjx_reinforce.engine.scalar.passes import liveness
+from mjx_reinforce.engine.scalar.primitives import writing_out
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,34 +56,46 @@ def scalarize(fn: Callable, *examples: PyTree, branch_cost: int = 400) -> Scalar
       branch_cost: a branch of ``cond`` with more operations than this, or with a loop, is skipped
         where no lane needs it; others are computed for every lane.
     """
-    return build(fn, examples, [True] * len(jax.tree.leaves(examples)), branch_cost)
+    return build(*trace(fn, *examples), branch_cost)
+
+
+def trace(fn: Callable, *examples: PyTree, unrolled: int = 1) -> tuple[jaxprs.Program, Any]:
+    """Returns a function's program to be written out, and the shapes of its result.
+
+    Args:
+      fn: a function of one example.
+      *examples: its arguments, or their shapes.
+      unrolled: see ``writing_out``.
+    """
+    with writing_out(unrolled):
+        return jaxprs.trace(fn, *examples)
 
 
 def build(
-    fn: Callable,
-    examples: Sequence[Any],
-    varying: Sequence[bool],
+    program: jaxprs.Program,
+    out_shape: Any,
     branch_cost: int,
-    limits: Limits = Limits(),  # noqa: B008 (a tuple of numbers)
+    scans: int = 4,
+    varying: Sequence[bool] | None = None,
 ) -> Scalarized:
     """Writes a function out.
 
     Args:
-      fn: a function of one example.
-      examples: its arguments, or their shapes.
-      varying: which of their leaves differ from lane to lane.
+      program: of ``trace``.
+      out_shape: of its result.
       branch_cost: as in ``scalarize``.
-      limits: up to which length scans are written out.
+      scans: up to which length scans are written out.
+      varying: which of its arguments differ from lane to lane; all do if nothing is said.
 
     Raises:
       TooLarge: it is more than is written out.
       UnsupportedPrimitive: it uses a primitive that has no rule.
     """
-    program, out_shape = jaxprs.trace(fn, *examples)
     if any(is_key(variable.aval) for variable in program.jaxpr.invars):
         raise jaxprs.no_keys()
     size.check_size(program)
-    graph = Graph(branch_cost, limits)
+    graph = Graph(branch_cost, scans)
+    varying = [True] * len(program.jaxpr.invars) if varying is None else varying
     inputs = [
         _input_array(graph, number, variable.aval, varies)
         for number, (variable, varies) in enumerate(zip(program.jaxpr.invars, varying, strict=True))

@@ -15,8 +15,6 @@ from mjx_reinforce.engine.scalar.nodes import FACTS
 MAX_SCALARS = 4_000_000
 #: A loop's body is written again and again until what never changes in it is known.
 _LOOP = 2
-#: The program that is written out of a primitive of ours, among its parameters.
-_CARRIES = {"by_engine": "one", "skippable": "computation"}
 _ELEMENTWISE = {*FACTS, "integer_pow", "square", "add_any", "clamp"}
 
 
@@ -51,8 +49,8 @@ def _equation_size(eqn: Any, default: Mapping[Any, int | None]) -> int:
         index = eqn.invars[0]
         known = None if jaxprs.is_literal(index) else default.get(index)
         return sum(sizes) if known is None else sizes[known]
-    if name in _CARRIES:
-        return num_scalars(jaxprs.program(params[_CARRIES[name]]))
+    if name == "skippable":
+        return num_scalars(jaxprs.program(params["computation"]))
     if name == "while":
         bodies = (params[part] for part in ("cond_jaxpr", "body_jaxpr"))
         return _LOOP * sum(num_scalars(jaxprs.program(body)) for body in bodies)

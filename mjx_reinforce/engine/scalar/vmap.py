@@ -112,7 +112,8 @@ class Mapped:
 
         written = self._written.get(key)
         if written is None:  # writing it out takes about a second
-            written = scalarized.build(flat_fn, examples, varying, self._branch_cost)
+            traced = scalarized.trace(flat_fn, *examples)
+            written = scalarized.build(*traced, self._branch_cost, varying=varying)
             if not written.captures:
                 self._written[key] = written
         return written, axes

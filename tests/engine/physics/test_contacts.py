@@ -1,5 +1,6 @@
 """Contacts of every pair of types of geoms that is right, in many poses, against C MuJoCo."""
 
+import contextlib
 import types
 
 import jax
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from mjx_reinforce import envs
 from mjx_reinforce.engine.physics import contact_rows, contacts, rows
 from mjx_reinforce.engine.physics.mjx_internals import jax_fields, with_contact
+from mjx_reinforce.engine.scalar import writing_out
 from mjx_reinforce.envs import models
 
 PAIR = """
@@ -257,31 +259,21 @@ def random_state(seed):
     return data
 
 
-def one_by_one_rows(one, whole, *operands, may_unroll):
-    return one(*operands)
-
-
-def at_once(one, whole, *operands, may_unroll):
-    return whole(*operands)
-
-
-@pytest.fixture(scope="module", params=[one_by_one_rows, at_once])
+@pytest.fixture(scope="module", params=[writing_out, contextlib.nullcontext])
 def made(request):
     """Makes the rows of C's data: Jacobian, reference, mass, position."""
     model = mjx.put_model(MODEL, impl="jax")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rows, "by_engine", request.param)
 
-        @jax.jit
-        def make(data):
-            fields = jax_fields(rows.make_constraint(model, data))
-            return fields.efc_J, fields.efc_aref, fields.efc_D, fields.efc_pos
+    @jax.jit
+    def make(data):
+        fields = jax_fields(rows.make_constraint(model, data))
+        return fields.efc_J, fields.efc_aref, fields.efc_D, fields.efc_pos
 
-        def of(data):
+    def of(data):
+        with request.param():
             return [np.asarray(x) for x in make(mjx.put_data(MODEL, data, impl="jax"))]
 
-        of(random_state(0))
-        yield of
+    return of
 
 
 @pytest.mark.parametrize("seed", range(4))

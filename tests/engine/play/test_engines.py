@@ -13,8 +13,9 @@ from players import actor_and_act
 from toys import Drifting
 
 from mjx_reinforce import Box, Discrete, make_vec, normal, rollout, unroll
-from mjx_reinforce.engine.play import available, choice, units
+from mjx_reinforce.engine.play import available, choice
 from mjx_reinforce.engine.play import choice as engines
+from mjx_reinforce.engine.scalar import writing_out
 from mjx_reinforce.learning.distributions import categorical
 from mjx_reinforce.learning.policy import MLP
 
@@ -240,7 +241,7 @@ def both(sizes, x, outputs=2):
     params = network.init(jax.random.key(0), x)
     params = jax.tree.map(lambda p: p + 0.1, params)  # biases, too
     plain = network.apply(params, x)
-    with units.one_at_a_time():
+    with writing_out():
         return plain, network.apply(params, x), jax.make_jaxpr(network.apply)(params, x)
 
 

@@ -118,13 +118,8 @@ def test_threads_meet_where_some_have_no_room_for_their_contacts(monkeypatch):
 def kernel_text(env, actor, act, distribution):
     examples = program.step_shapes(env, actor)[:-1]
     function = program.step_function(env, act, distribution, 50)
-    written = scalarized.build(
-        lambda *args: function(*args, jnp.int32(1)),
-        examples,
-        [True] * len(jax.tree.leaves(examples)),
-        program.BRANCH_COST,
-        program.GPU_LOOPS,
-    )
+    traced = scalarized.trace(program.while_running(function), *examples, unrolled=25)
+    written = scalarized.build(*traced, program.BRANCH_COST, program.SCANS)
     return kernels.kernel_text(written, len(jax.tree.leaves(actor)))
 
 

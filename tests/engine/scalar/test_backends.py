@@ -16,7 +16,7 @@ from mjx_reinforce.engine.llvm.text import Text
 from mjx_reinforce.engine.play import program
 from mjx_reinforce.engine.play.program import machine_map
 from mjx_reinforce.engine.scalar import scalarized, skippable
-from mjx_reinforce.engine.scalar.graph import Graph, Limits
+from mjx_reinforce.engine.scalar.graph import Graph
 from mjx_reinforce.engine.scalar.nodes import FACTS, Op, conversion, is_constant
 from mjx_reinforce.engine.scalar.passes import simplify
 from mjx_reinforce.engine.scalar.passes.liveness import LiveLoop, accumulators
@@ -81,7 +81,7 @@ def test_a_load_says_how_its_place_is_aligned(align):
         pairs = x[:4].reshape(2, 2)
         return lax.scan(lambda sums, row: (sums * row[0], None), x[5], pairs)[0]
 
-    written = scalarized.build(total, (jnp.ones(6),), [True], 400, Limits(1, 1))
+    written = scalarized.build(*scalarized.trace(total, jnp.ones(6)), 400, 1)
     text = Text(1)
     backend = LLVM(text, lambda number: Input("%input", np.dtype(np.float32), align))
     backend.compile(written.schedule, written.outputs)
@@ -100,7 +100,7 @@ def folded_and_computed(name):
     assert (folded.dtype, np.ndim(folded)) == (dtype, 0), name
     assert np.isfinite(folded), name
     _, *mixes = itertools.product([False, True], repeat=len(operands))
-    steps, outputs, graph = [], [], Graph(0, Limits())
+    steps, outputs, graph = [], [], Graph(0, 4)
     leaves = [graph.leaf(x.dtype, True, position=(0, i)) for i, x in enumerate(operands)]
     for mix in mixes:
         mixed = [leaf if lane else x for leaf, x, lane in zip(leaves, operands, mix, strict=True)]
@@ -121,7 +121,7 @@ def test_constants_fold_to_what_jax_computes():
 
 
 def test_operations_that_commute_are_shared():
-    graph = Graph(0, Limits())
+    graph = Graph(0, 4)
     for name in (n for n, facts in FACTS.items() if facts.commutes):
         x, y = (graph.leaf(operands_of(name)[0].dtype, True) for _ in range(2))
         assert graph.call(name, x, y) is graph.call(name, y, x), name
@@ -230,7 +230,7 @@ def ends_early(weights):
 def loops_of(function):
     """Loops in the order of their ends, from the innermost on."""
     example = jnp.ones(4)
-    written = scalarized.build(function, (example,), [True], 100, program.LOOPS)
+    written = scalarized.build(*scalarized.trace(function, example), 100, program.SCANS)
 
     def within(body):
         for step in body:

@@ -1,5 +1,6 @@
 """Loops and branches: what JAX computes, ended or skipped where no lane needs more."""
 
+import functools
 import itertools
 
 import jax
@@ -11,7 +12,6 @@ from mapped import assert_same, batch_of, collatz, count, heavy, line_search, pr
 
 from mjx_reinforce.engine import scalar
 from mjx_reinforce.engine.scalar import jaxprs, scalarized, size
-from mjx_reinforce.engine.scalar.graph import Limits
 from mjx_reinforce.engine.scalar.nodes import Node
 from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop
 
@@ -78,7 +78,7 @@ def test_short_loops_are_written_out():
     plain = lambda x: lax.fori_loop(0, 3, lambda _, y: jnp.sin(y), x)  # noqa: E731
     reading = lambda x: lax.scan(lambda c, y: (jnp.sin(c) + y, None), x, x * jnp.arange(3.0))[0]  # noqa: E731
     for function in (plain, reading):
-        written = (scalarized.build(function, (1.0,), [True], 400, Limits(n)) for n in (2, 3))
+        written = (scalarized.build(*scalarized.trace(function, 1.0), 400, n) for n in (2, 3))
         assert [each.operations["sin"] for each in written] == [1, 3]
 
 
@@ -199,137 +199,52 @@ def test_a_gate_computes_what_its_results_need():
 
 
 # -------------------------------------------------------------------------------------------------
-# What a function says to be written out as: the choice by engine, and what may be skipped.
+# What a function says to be written out as: which way it takes, and what may be skipped.
 
 
-def choice(x, scale=1.0):
-    """Tells which of the two was computed: x + 1 is `one`, 2 x is `many`."""
-    return scalar.by_engine(lambda y: scale * (y + 1), lambda y: scale * (2 * y), x)
+def choice(x):
+    """Tells whether it is written out."""
+    return x + 1 if scalar.is_written_out() else 2 * x
 
 
 X = jnp.arange(3.0)
 
 
-def test_xla_computes_many():
-    for transformed in (
-        choice,
-        jax.jit(choice),
-        jax.vmap(choice),
-        jax.jit(jax.vmap(jax.vmap(choice, in_axes=0), in_axes=None, axis_size=1)),
-        lambda x: jax.vmap(choice, in_axes=(0, None))(x, 1.0),
-        jax.checkpoint(choice),
-        lambda x: lax.map(choice, x),
-        lambda x: lax.cond(x[0] < 9, choice, jnp.sin, x),
-        scalar.prune(lambda x: (choice(x), jnp.sort(x))[0]),
-    ):
-        np.testing.assert_array_equal(np.squeeze(transformed(X)), 2 * X)
-
-
-def test_one_is_written_out():
+def test_a_function_knows_whether_it_is_written_out():
+    """Also what JAX has traced before for the other."""
+    kept = jax.jit(choice)
     for function in (
         choice,
-        jax.jit(choice),
+        kept,
         lambda x: lax.cond(x < 9, choice, jnp.sin, x),
         jax.checkpoint(choice),
+        scalar.prune(lambda x: (kept(x), jnp.cos(x))[0]),
     ):
-        np.testing.assert_array_equal(scalar.vmap(function)(X), X + 1)
+        for _ in range(2):
+            np.testing.assert_array_equal(jax.vmap(function)(X), 2 * X)
+            np.testing.assert_array_equal(scalar.vmap(function)(X), X + 1)
+    assert scalar.scalarize(kept, X).operations == {"add": 3}
+    assert size.num_scalars(scalarized.trace(kept, X)[0]) == 3
 
 
-def test_xla_does_not_read_what_is_written_out(monkeypatch):
-    """To map it takes as long as to map what XLA compiles."""
-    read = property(lambda _: pytest.fail("the program was read"))
-    monkeypatch.setattr(scalar.primitives._Mapped, "_traced", read)
-    twice = jax.jit(jax.vmap(jax.vmap(choice)))
-    np.testing.assert_array_equal(twice(jnp.ones((2, 3))), 2 * jnp.ones((2, 3)))
-    with pytest.raises(pytest.fail.Exception, match="was read"):
-        scalar.vmap(jax.vmap(choice))(jnp.ones((2, 3)))
-    monkeypatch.undo()
-    x = jnp.ones((2, 3))
-    np.testing.assert_array_equal(scalar.vmap(jax.vmap(choice))(x), x + 1)
-
-
-def test_a_mapped_program_is_part_of_the_fingerprint():
-    """Its constants too, and those of programs in it."""
-
-    def mapped(offset):
-        offset = np.full(3, offset, np.float32)
-        return jax.vmap(lambda x: scalar.by_engine(lambda y: y + offset, lambda y: y, x))
-
-    prints = [jaxprs.fingerprint(jaxprs.trace(mapped(k), jnp.ones((2, 3)))[0]) for k in (1, 1, 2)]
-    assert prints[0] == prints[1] != prints[2]
-
-
-def test_derivatives_are_those_of_many():
-    """For all engines, forwards and in reverse, with respect to what is closed over too."""
-    for mapped in (jax.vmap, scalar.vmap):
-        np.testing.assert_array_equal(mapped(jax.grad(choice))(X), [2.0, 2.0, 2.0])
-        np.testing.assert_array_equal(mapped(jax.grad(choice, 1), (0, None))(X, 1.0), 2 * X)
-        np.testing.assert_array_equal(mapped(jax.jacfwd(choice))(X), [2.0, 2.0, 2.0])
-
-
-def test_derivatives_pass_integers_by():
-    pick = lambda x, i: scalar.by_engine(lambda x, i: x[i], lambda x, i: x[i] * 2, x, i)  # noqa: E731
-    np.testing.assert_array_equal(jax.grad(pick)(X, 1), [0.0, 2.0, 0.0])
-
-
-def test_a_result_of_nothing_mapped_stays_one():
-    """As of `lax.cond`: what XLA computes for all lanes together is not computed for each."""
-
-    def fn(x, y):
-        return scalar.by_engine(lambda x, y: (x, y + 1), lambda x, y: (x, y + 2), x, y)
-
-    out = jax.jit(jax.vmap(fn, in_axes=(0, None), out_axes=(0, None)))(X, 1.0)
-    assert out[1].shape == ()
-    np.testing.assert_array_equal(out[1], 3.0)
-
-
-def test_the_size_is_that_of_one():
-    traced, _ = jaxprs.trace(
-        lambda x: scalar.by_engine(lambda x: x + 1, lambda x: jnp.sin(jnp.cos(x)), x), X
-    )
-    assert size.num_scalars(traced) == 3
-
-
-def test_what_is_not_traced_is_computed_at_once():
-    """Without a look at ``one``; programs that have been traced are computed without it too."""
-    scalar.by_engine(pytest.fail, lambda x: x, X)
-    jaxpr = jax.make_jaxpr(choice)(X)
-    assert "by_engine" in str(jaxpr)
-    np.testing.assert_array_equal(jax.core.eval_jaxpr(jaxpr.jaxpr, jaxpr.consts, X)[0], 2 * X)
-
-
-@pytest.mark.parametrize("other", [lambda x: (x,), lambda x: x[:1], lambda x: x > 0])
-def test_results_that_differ_are_refused(other):
-    with pytest.raises(TypeError, match="by_engine got two different results"):
-        jax.jit(lambda x: scalar.by_engine(lambda x: x, other, x))(X)
-
-
-def total(x, **options):
+def total(x, scan=lax.scan, **options):
     step = lambda carry, row: (carry + jnp.sin(row), None)  # noqa: E731
-    return lax.scan(step, 0.0, x, **options)[0]
+    return scan(step, 0.0, x, **options)[0]
 
 
-def sines(fn, unrollable, length=7):
-    limits = Limits(1, unrollable)
-    return scalarized.build(fn, (jnp.ones(length),), [True], 400, limits).operations["sin"]
+def sines(fn, unrolled, length=7):
+    traced = scalarized.trace(fn, jnp.ones(length), unrolled=unrolled)
+    return scalarized.build(*traced, 400, 1).operations["sin"]
 
 
-def chosen(may_unroll, inner=total):
-    return lambda x: scalar.by_engine(inner, lambda x: x[0], x, may_unroll=may_unroll)
-
-
-def test_scans_that_may_be_written_out_are_up_to_a_length():
-    counts = [sines(chosen(may), most) for may, most in ((False, 7), (True, 6), (True, 7))]
-    assert counts == [1, 1, 7]
-
-
-def test_scans_inside_loops_are_not_what_may_be_written_out():
-    def nested(x):
-        return lax.fori_loop(0, 9, lambda _, y: y + total(x), 0.0)
-
-    assert sines(chosen(True, nested), 7) == 1
-    # Jitted functions are no loops, and what comes behind the mark is not marked.
-    assert sines(lambda x: chosen(True, jax.jit(total))(x) + total(2 * x), 7) == 7 + 1
+def test_short_scans_are_written_out():
+    for scan, unrolled, expected in (
+        (lax.scan, 7, 1),
+        (scalar.short_scan, 6, 1),
+        (scalar.short_scan, 7, 7),
+    ):
+        assert sines(functools.partial(total, scan=scan), unrolled) == expected
+    np.testing.assert_allclose(total(X, scalar.short_scan), np.sin(X).sum(), rtol=1e-6)
 
 
 def test_the_unroll_of_a_scan_means_what_it_means_to_jax():
@@ -388,6 +303,6 @@ def test_results_must_be_of_the_structure_of_what_is_skipped_to():
 
 
 def test_its_size_is_that_of_the_computation():
-    traced = jaxprs.trace(plus_sine, jnp.ones(()))[0]
+    traced = scalarized.trace(plus_sine, jnp.ones(()))[0]
     alone = jaxprs.trace(lambda x: x + jnp.sin(x), jnp.ones(()))[0]
     assert size.num_scalars(traced) == size.num_scalars(alone) + 1  # and the comparison

@@ -86,14 +86,13 @@ def through_jit(x):
 
 
 def test_unsupported_primitives_name_the_line_of_the_user():
-    """Also inside of a jitted function, of a loop, of random numbers, of a choice by engine."""
+    """Also inside of a jitted function, of a loop, of random numbers."""
     draw = lambda x: jax.random.normal(jax.random.wrap_key_data(x[:2].astype(jnp.uint32)), (2,))  # noqa: E731
     for primitive, function, fn in [
         ("eigh", "<lambda>", lambda x: lax.linalg.eigh(jnp.outer(x, x))[0]),
         ("fft", "through_jit", through_jit),
         ("fft", "through_jit", lambda x: lax.map(through_jit, x[None])),
         ("threefry2x32", "<lambda>", draw),
-        ("fft", "through_jit", lambda x: scalar.by_engine(through_jit, jnp.sin, x)),
     ]:
         words = rf"primitive '{primitive}', used at \S*test_fused\.py:\S* \(\S*{function}"
         with pytest.raises(scalar.UnsupportedPrimitive, match=words):

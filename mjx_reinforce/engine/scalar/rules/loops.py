@@ -2,7 +2,7 @@
 
 ``while`` and ``scan`` become loops that end when no lane needs another iteration. Of ``cond``,
 cheap branches are both evaluated, and expensive ones skipped if unneeded. Of ``skippable``, nothing
-is selected. Of ``by_engine``, the program for one episode is taken.
+is selected.
 """
 
 from collections.abc import Callable, Sequence
@@ -84,8 +84,7 @@ def scan_rule(graph: Graph, run: Callable, eqn: Equation, used: Any, *operands: 
         return carry.unpack(results[:num_carry]), outs.unpack(results[num_carry:])
 
     rows = [ins.unpack([x[t : t + 1] for x in operands[split:]]) for t in order]
-    limit = graph.limits.unrollable if graph.may_unroll else graph.limits.scans
-    if length <= max(limit, eqn.params["unroll"]):
+    if length <= max(graph.scans, eqn.params["unroll"]):
         final, table = _unroll(step, carry.unpack(init), rows)
     else:
         foreseen = None
@@ -229,14 +228,6 @@ def skippable_rule(
     if body is None:
         return layout.pack(compute())
     return layout.pack(_close(graph, body, predicate, body.results, layout.unpack(otherwise)))
-
-
-def by_engine_rule(
-    graph: Graph, run: Callable, eqn: Equation, used: list[bool], *operands: Array
-) -> Results:
-    """Takes the program for an engine that writes out; see ``by_engine``."""
-    program = jaxprs.program(eqn.params["one"])
-    return run(program, list(operands), used, may_unroll=eqn.params["may_unroll"])
 
 
 def whole_rule(
