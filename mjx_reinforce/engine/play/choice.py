@@ -22,7 +22,7 @@ from mjx_reinforce.engine.checks import check_count, check_key, check_name, chec
 from mjx_reinforce.engine.contract import check_policy
 from mjx_reinforce.engine.play import available, native, program, rollouts
 from mjx_reinforce.engine.scalar import scalarized, size
-from mjx_reinforce.engine.scalar.vmap import MAX_OPERATIONS
+from mjx_reinforce.engine.scalar.vmap import MAX_OPERATIONS, evaluate
 from mjx_reinforce.engine.team import program as team
 
 #: This JAX multiplies wrongly on CPUs, in some functions that are mapped over some 16,000 rows and
@@ -190,15 +190,18 @@ def _in_scalars(
     """Returns a function that is small enough for XLA's kernels on a GPU, written out for them."""
     if size.num_scalars(scalarized.trace(function, *examples)[0]) >= _SMALL:
         return None
-    # On a GPU a real branch makes the host wait for its predicate: both sides are computed.
-    mapped = scalar.vmap(function, branch_cost=MAX_OPERATIONS)
-    batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct((1, *x.shape), x.dtype), examples)
     try:
-        written = mapped.write(*batch)
+        # On a GPU a real branch makes the host wait for its predicate: both sides are computed.
+        written = scalar.scalarize(function, *examples, branch_cost=MAX_OPERATIONS)
     except Exception:  # whatever it is, another engine may play this
         return None
     if sum(written.operations.values()) > MAX_OPERATIONS:
         return None
+
+    def mapped(*args: PyTree) -> Any:
+        leaves = jax.tree.leaves(args)
+        return evaluate(written, leaves, [True] * len(leaves))
+
     return "fused", "on a GPU XLA's kernels are the fastest for so small a step", mapped
 
 

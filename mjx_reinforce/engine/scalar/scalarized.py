@@ -27,7 +27,6 @@ class Scalarized:
     out_avals: shape and dtype of each leaf of the result.
     outputs: the scalars of each leaf of the result.
     schedule: the steps that compute them.
-    captures: whether it closes over an array that an outer transformation traces.
     """
 
     in_avals: list[Any]
@@ -35,7 +34,6 @@ class Scalarized:
     out_avals: list[Any]
     outputs: list[list[Scalar]]
     schedule: liveness.Schedule
-    captures: bool
 
     def compile(self, backend: Backend) -> Any:
         """Returns what a backend makes of the function."""
@@ -110,7 +108,6 @@ def build(
         out_avals=out_avals,
         outputs=outputs,
         schedule=liveness.schedule(graph.scope, (x for leaf in outputs for x in leaf)),
-        captures=bool(graph.captured),
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 
 from mjx_reinforce.engine.base import PyTree
-from mjx_reinforce.engine.scalar import jaxprs, scalarized
+from mjx_reinforce.engine.scalar import scalarized
 from mjx_reinforce.engine.scalar.backend import Backend
 from mjx_reinforce.engine.scalar.jaxprs import operation
 from mjx_reinforce.engine.scalar.nodes import Captured, Node, Op, Scalar, is_constant
@@ -27,7 +27,7 @@ MAX_OPERATIONS = 20_000
 
 def vmap(
     fn: Callable, in_axes: PyTree = 0, out_axes: PyTree = 0, branch_cost: int = 32
-) -> "Mapped":
+) -> Callable[..., Any]:
     """Maps a function over a batch, like ``jax.vmap``, one array over the batch for each scalar.
 
     The function is traced for one example and evaluated element by element; see the package's
@@ -47,126 +47,58 @@ def vmap(
       The mapped function, of positional arguments.
 
     Raises:
-      ValueError: if no argument is mapped, the mapped sizes differ, or an axis does not fit.
+      ValueError: where ``jax.vmap`` raises it.
       TooLarge: if fn is more than is written out.
       UnsupportedPrimitive: if fn uses a primitive that has no rule, or reads typed PRNG keys.
     """
-    return Mapped(fn, in_axes, out_axes, branch_cost)
+    one = jax.custom_batching.custom_vmap(lambda *args: fn(*args))
 
-
-class Mapped:
-    """What ``vmap`` returns: a function that is written out once for each kind of arguments."""
-
-    def __init__(self, fn: Callable, in_axes: PyTree, out_axes: PyTree, branch_cost: int):
-        """Takes the arguments of ``vmap``."""
-        functools.update_wrapper(self, fn)
-        self._fn = fn
-        self._in_axes, self._out_axes = in_axes, out_axes
-        self._branch_cost = branch_cost
-        self._written: dict[Any, scalarized.Scalarized] = {}
-
-    def __call__(self, *args: PyTree) -> Any:
-        """Evaluates the function for every example of a batch."""
-        args = jax.tree.map(jnp.asarray, args)
-        written, axes = self._write(args)
-        count = sum(written.operations.values())
-        if count > MAX_OPERATIONS:
-            warnings.warn(
-                f"written out this function is {count:,} scalar operations, and XLA takes minutes "
-                f"to compile more than {MAX_OPERATIONS:,}; use jax.vmap for it",
-                stacklevel=2,
-            )
-        leaves = jax.tree.leaves(args)
-        batch = _batch_size(leaves, axes)
-        rows = [_rows(leaf, axis) for leaf, axis in zip(leaves, axes, strict=True)]
-
-        def read(place: tuple[int, int]) -> jax.Array:
-            return lax.index_in_dim(rows[place[0]], place[1], keepdims=False)
-
-        values = written.compile(XLA(read, (batch,)))
-        out_tree = written.out_tree
-        target = jax.tree.unflatten(out_tree, range(out_tree.num_leaves))
-        ends = _axes(self._out_axes, target)
-        outputs = [
-            _assemble(scalars, aval, axis, batch)
-            for scalars, aval, axis in zip(values, written.out_avals, ends, strict=True)
+    @one.def_vmap
+    def _(batch, mapped, *args):
+        varying = jax.tree.leaves(mapped)
+        leaves, tree = jax.tree.flatten(args)
+        examples = [
+            jax.ShapeDtypeStruct(jnp.shape(x)[varies:], jnp.result_type(x))
+            for x, varies in zip(leaves, varying, strict=True)
         ]
-        return jax.tree.unflatten(out_tree, outputs)
+        traced = scalarized.trace(fn, *tree.unflatten(examples))
+        written = scalarized.build(*traced, branch_cost, varying=varying)
+        return evaluate(written, leaves, varying), jax.tree.map(lambda _: True, traced[1])
 
-    def write(self, *args: PyTree) -> scalarized.Scalarized:
-        """Returns what is evaluated for these arguments, of which the shapes are enough."""
-        return self._write(args)[0]
-
-    def _write(self, args: tuple) -> tuple[scalarized.Scalarized, list[int | None]]:
-        """Returns the function written out for these arguments, and the axis of each leaf."""
-        leaves, in_tree = jax.tree.flatten(args)
-        mapped = [*zip(_axes(self._in_axes, args), leaves, strict=True)]
-        axes = [None if axis is None else _axis(axis, leaf.ndim) for axis, leaf in mapped]
-        examples = [_example(leaf, axis) for leaf, axis in zip(leaves, axes, strict=True)]
-        varying = tuple(axis is not None for axis in axes)
-        precision = jnp.result_type(float)  # constants inside depend on it
-        key = (in_tree, tuple((x.shape, x.dtype) for x in examples), varying, precision)
-
-        def flat_fn(*flat: PyTree) -> Any:
-            return self._fn(*jax.tree.unflatten(in_tree, flat))
-
-        written = self._written.get(key)
-        if written is None:  # writing it out takes about a second
-            traced = scalarized.trace(flat_fn, *examples)
-            written = scalarized.build(*traced, self._branch_cost, varying=varying)
-            if not written.captures:
-                self._written[key] = written
-        return written, axes
+    return functools.wraps(fn)(jax.vmap(one, in_axes, out_axes))
 
 
-def _axes(prefix: PyTree, tree: PyTree) -> list[Any]:
-    """Returns the axis of each leaf of the tree, as a pytree prefix says."""
-    if isinstance(prefix, list) and isinstance(tree, tuple):
-        prefix = tuple(prefix)
-    axes: list[Any] = []
+def evaluate(written: scalarized.Scalarized, leaves: Sequence[Any], varying: Sequence[bool]) -> Any:
+    """Evaluates a function for every example of a batch, the first axis of all results.
 
-    def note(axis: Any, subtree: PyTree) -> None:
-        axes.extend([axis] * len(jax.tree.leaves(subtree)))
-
-    jax.tree.map(note, prefix, tree, is_leaf=lambda x: x is None)
-    return axes
-
-
-def _axis(axis: int | None, ndim: int) -> int:
-    """Returns a mapped axis counted from the front."""
-    if axis is None or not -ndim <= axis < ndim:
-        raise ValueError(f"axis {axis} does not exist in an array of {ndim} dimensions")
-    return axis % ndim
-
-
-def _batch_size(leaves: list[jax.Array], axes: list[int | None]) -> int:
-    sizes = {x.shape[axis] for x, axis in zip(leaves, axes, strict=True) if axis is not None}
-    if len(sizes) != 1:
-        raise ValueError(
-            f"scalar.vmap needs mapped arguments of one size, got sizes {sorted(sizes)}"
+    Args:
+      written: the function.
+      leaves: of its arguments.
+      varying: whether the first axis of each is the batch; one at least is so.
+    """
+    count = sum(written.operations.values())
+    if count > MAX_OPERATIONS:
+        warnings.warn(
+            f"written out this function is {count:,} scalar operations, and XLA takes minutes "
+            f"to compile more than {MAX_OPERATIONS:,}; use jax.vmap for it",
+            stacklevel=2,
         )
-    return sizes.pop()
+    batch = leaves[list(varying).index(True)].shape[0]
+    rows = [
+        jnp.moveaxis(x, 0, -1).reshape(-1, batch) if varies else jnp.reshape(x, -1)
+        for x, varies in zip(leaves, varying, strict=True)
+    ]
 
+    def read(place: tuple[int, int]) -> jax.Array:
+        return lax.index_in_dim(rows[place[0]], place[1], keepdims=False)
 
-def _example(x: jax.Array, axis: int | None) -> jax.ShapeDtypeStruct:
-    """Returns the shape of one example."""
-    shape = tuple(size for i, size in enumerate(x.shape) if i != axis)
-    return jax.ShapeDtypeStruct(shape, x.dtype)
-
-
-def _rows(x: jax.Array, axis: int | None) -> jax.Array:
-    """Returns an argument as [elements, batch], or [elements] where lanes share it."""
-    if axis is None:
-        return x.reshape(-1)
-    return jnp.moveaxis(x, axis, -1).reshape(-1, x.shape[axis])
-
-
-def _assemble(scalars: list[Any], aval: jaxprs.Shape, axis: int | None, batch: int) -> jax.Array:
-    """Puts one leaf of the result together."""
-    lanes = [x if np.ndim(x) else lax.broadcast(x, (batch,)) for x in scalars]
-    stacked = jnp.stack(lanes) if lanes else jnp.zeros((0, batch), aval.dtype)
-    shaped = stacked.reshape((*aval.shape, batch))
-    return jnp.moveaxis(shaped, -1, _axis(axis, shaped.ndim))
+    outputs = []
+    values = written.compile(XLA(read, (batch,)))
+    for scalars, aval in zip(values, written.out_avals, strict=True):
+        lanes = [x if np.ndim(x) else lax.broadcast(x, (batch,)) for x in scalars]
+        stacked = jnp.stack(lanes) if lanes else jnp.zeros((0, batch), aval.dtype)
+        outputs.append(jnp.moveaxis(stacked.reshape((*aval.shape, batch)), -1, 0))
+    return jax.tree.unflatten(written.out_tree, outputs)
 
 
 Values = dict[Node, Any]

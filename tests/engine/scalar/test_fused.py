@@ -38,10 +38,10 @@ def test_axes_of_pytrees_and_shared_arguments():
 
 def test_wrong_axes_are_refused():
     for fn, args, axes, message in [
-        (jnp.add, (jnp.ones(3), jnp.ones(4)), {}, "one size"),
-        (jnp.add, (jnp.ones(3), jnp.ones(3)), {"in_axes": None}, "one size"),
-        (jnp.sin, (jnp.ones(3),), {"in_axes": 2}, "axis 2"),
-        (jnp.sin, (jnp.ones(3),), {"out_axes": None}, "axis None"),
+        (jnp.add, (jnp.ones(3), jnp.ones(4)), {}, "inconsistent sizes"),
+        (jnp.add, (jnp.ones(3), jnp.ones(3)), {"in_axes": None}, "at least one"),
+        (jnp.sin, (jnp.ones(3),), {"in_axes": 2}, "rank should be at least 3"),
+        (jnp.sin, (jnp.ones(3),), {"out_axes": None}, "out_axes"),
     ]:
         with pytest.raises(ValueError, match=message):
             scalar.vmap(fn, **axes)(*args)
