@@ -15,7 +15,7 @@ from mjx_reinforce.files import check_output, csv_text, write_bytes
 from mjx_reinforce.reports import document, sources, words
 from mjx_reinforce.reports.charts import Table, render_chart, rows, short
 from mjx_reinforce.reports.document import Watch, encoded
-from mjx_reinforce.reports.experiment import Experiment, relabel, say
+from mjx_reinforce.reports.experiment import Experiment, say
 from mjx_reinforce.reports.findings import Findings, compute_findings, swept, worst_seeds
 from mjx_reinforce.settings.config import env_flag
 from mjx_reinforce.settings.flags import run_command
@@ -36,9 +36,6 @@ class ReportSettings:
     in the current folder. Pictures and tables go into a folder of that name, without .html."""
     overwrite: bool = False
     """Replace a page that exists, with its pictures and tables."""
-    labels: tuple[str, ...] = ()
-    """New names for configurations, each OLD=NEW. NEW must have no "=". Example:
-    --labels "estimator reinforce=REINFORCE" "estimator leave-one-out=leave-one-out baseline"."""
 
 
 def main() -> None:
@@ -48,24 +45,12 @@ def main() -> None:
 
 def _report(settings: ReportSettings) -> None:
     """Writes a report, and says where it is."""
-    if settings.output is not None:
-        check_page(settings.output, settings.overwrite)
-    names = _new_names(settings.labels)
-    experiment = relabel(sources.read_experiment(settings.sources), names)
+    experiment = sources.read_experiment(settings.sources)
     output = settings.output or _default_output(settings.sources)
     check_page(output, settings.overwrite)
     seconds = _write(experiment, output).seconds
     took = f"{output.stat().st_size / 1e6:.1f} MB, {seconds:.1f} s"
     print(f"{output} ({took}), pictures and tables in {_beside(output)}")
-
-
-def _new_names(labels: Sequence[str]) -> dict[str, str]:
-    """Returns new names of configurations by the old ones; raises ValueError for what is none."""
-    for text in labels:
-        old, equals, new = text.rpartition("=")
-        if not (old and equals and new.strip()):
-            raise ValueError(f"--labels takes OLD=NEW, got {text!r}")
-    return {old: new.strip() for old, _, new in (text.rpartition("=") for text in labels)}
 
 
 def _default_output(chosen: Sequence[Path]) -> Path:

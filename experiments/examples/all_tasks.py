@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 
-from mjx_reinforce.reports.experiment import relabel
 from mjx_reinforce.reports.findings import Findings, compute_findings
 from mjx_reinforce.reports.sources import read_experiment
 from mjx_reinforce.statistics.survival import log_rank
@@ -26,11 +25,10 @@ def read(directories: list[Path]) -> list[Findings]:
         known = next(each / x for x in ("sweep.json", "config.json") if (each / x).is_file())
         tasks.setdefault(json.loads(known.read_text("utf-8"))["env"], []).append(each)
     found = [read_experiment(some) for some in tasks.values()]
-    alone = all(len(each.configurations) == 1 for each in found)  # and named as its directory
-    return [
-        compute_findings(relabel(e, {e.configurations[0].label: "all"} if alone else {}))
-        for e in found
-    ]
+    if all(len(each.configurations) == 1 for each in found):  # and named as its directory
+        parts = [each.configurations[0]._replace(label="all") for each in found]
+        found = [e._replace(configurations=[x]) for e, x in zip(found, parts, strict=True)]
+    return [*map(compute_findings, found)]
 
 
 def scores(found: Findings, name: str) -> np.ndarray:

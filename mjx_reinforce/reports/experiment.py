@@ -102,29 +102,3 @@ def ordered(values: Sequence[Any]) -> list[Any]:
     different = list({repr(value): value for value in values}.values())
     numbers = all(isinstance(x, int | float) for x in different)
     return sorted(different) if numbers else different
-
-
-def relabel(experiment: Experiment, labels: Mapping[str, str]) -> Experiment:
-    """Returns an experiment whose configurations have other names.
-
-    Args:
-      experiment: what was read.
-      labels: new names by old names; a configuration that is not in it keeps its name.
-
-    Raises:
-      ValueError: an old name is of no configuration, or two would have the same name.
-    """
-    known = [part.label for part in experiment.configurations]
-    for label in labels:
-        if label not in known:
-            listed = "; ".join(known[:8]) + ("; ..." if len(known) > 8 else "")
-            raise ValueError(f"--labels: no configuration is called {label!r}; there are {listed}")
-    renamed = [
-        part._replace(label=labels.get(part.label, part.label))
-        for part in experiment.configurations
-    ]
-    names = [part.label for part in renamed]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"--labels: two configurations would be called {name!r}")
-    return experiment._replace(configurations=renamed)

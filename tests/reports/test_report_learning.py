@@ -4,10 +4,9 @@ import re
 
 import numpy as np
 import pytest
-import vl_convert
 from fake_sweeps import make_sweep
 from measured_runs import make_measured_run
-from pages import change_curves, content, findings_of, visible
+from pages import change_curves, findings_of, visible
 
 from mjx_reinforce import report
 from mjx_reinforce.reports import listings, words
@@ -89,36 +88,6 @@ def test_every_figure_is_a_vector_and_every_table_has_a_number(crossed):
     assert {path.suffix for path in beside.iterdir()} == {".png", ".svg", ".csv"}
     numbers = re.findall(r"Table (\d)\.", visible(crossed[0] / "report.html"))
     assert numbers == ["1", "2", "3", "4"]
-
-
-@pytest.mark.slow
-def test_configurations_have_the_names_that_are_asked_for(tmp_path, monkeypatch):
-    directory = make_sweep(tmp_path / "sweep", num_seeds=8, over=RATES)
-    names = ["learning rate 0.01=fast", "learning rate 0.001=slow"]
-    monkeypatch.setattr("sys.argv", ["report", str(directory), "--labels", *names])
-    monkeypatch.setattr(report, "render_chart", lambda *_: {})
-    monkeypatch.setattr(vl_convert, "javascript_bundle", lambda code: code)
-    report.main()
-    page = directory / "report.html"
-    assert set(content(page)["labels"]) == {"fast", "slow", "learning rate 0.003"}
-    assert "learning rate 0.01" not in (directory / "report" / "curves.csv").read_text()
-
-
-@pytest.mark.parametrize(
-    ("label", "said"),
-    [
-        ("fast", "--labels takes OLD=NEW"),
-        ("rate=fast", "no configuration is called 'rate'; there are learning rate 0.001;"),
-        ("learning rate 0.01=learning rate 0.003", "two configurations would be called"),
-    ],
-)
-def test_names_that_cannot_be_are_refused(tmp_path, monkeypatch, capsys, label, said):
-    directory = make_sweep(tmp_path / "sweep", num_seeds=4, over=RATES)
-    monkeypatch.setattr("sys.argv", ["report", str(directory), "--labels", label])
-    with pytest.raises(SystemExit, match="2"):
-        report.main()
-    assert said in capsys.readouterr().err
-    assert not (directory / "report.html").exists()
 
 
 def test_a_run_is_told_in_plain_words(tmp_path):
