@@ -124,7 +124,7 @@ def _text(findings: Findings, drawn: list[charts.Chart]) -> dict[str, Any]:
         "failures": failures,
         "pairs": counted(len(findings.comparisons), "pair"),
         "listed": listed,
-        "until": steps(findings.learning.until),
+        "until": steps(findings.until),
         "numbers": {name: place for place, name in enumerate(listed, start=1)},
         "sensitivity": sensitivity,
         "compared": COMPARED,

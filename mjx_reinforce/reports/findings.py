@@ -70,8 +70,7 @@ class Result(NamedTuple):
     iqm: of the final returns, see ``statistics.iqm``
     band: the interquartile mean over ``Findings.grid``, arrays [K]; NaN beyond its budget
     seeds: [K, S] the curves on the grid
-    areas, area: [S] the mean return over the training of each seed, which is the area under the
-      seed's learning curve by the env steps, and the mean over seeds
+    area: of each seed's mean return over its training, the area under its learning curve
     solving: None where the task has no threshold
     """
 
@@ -83,7 +82,6 @@ class Result(NamedTuple):
     iqm: Estimate
     band: Estimate
     seeds: np.ndarray
-    areas: np.ndarray
     area: Estimate
     solving: Solving | None
 
@@ -99,32 +97,6 @@ class Few(NamedTuple):
     needed: int | None
 
 
-class SpeedTest(NamedTuple):
-    """The log-rank test of two results, ``first`` and ``second`` being their places.
-
-    p_value: that both solve the task equally soon
-    adjusted: the same after Holm's correction for all pairs
-    """
-
-    first: int
-    second: int
-    p_value: float
-    adjusted: float
-
-
-class Learning(NamedTuple):
-    """How fast the results learn.
-
-    until: env steps at which the areas end and the mean env steps to solve are cut off
-    speeds: of all pairs of the best results; empty where the task has no threshold
-    areas: the same pairs by the mean return over the training
-    """
-
-    until: int
-    speeds: list[SpeedTest]
-    areas: list[Comparison]
-
-
 class Findings(NamedTuple):
     """All figures of a report.
 
@@ -132,7 +104,8 @@ class Findings(NamedTuple):
     order: of each result, the place of its configuration in the experiment
     grid: [K] env steps
     comparisons: of all pairs of the best results, which are numbered by their places here
-    learning: how fast the configurations learn
+    speeds: p values of equal times to solve of the same pairs, see ``compare_speeds``
+    until: env steps at which areas end and the mean env steps to solve are cut off
     """
 
     experiment: Experiment
@@ -141,7 +114,8 @@ class Findings(NamedTuple):
     grid: np.ndarray
     comparisons: list[Comparison]
     few: Few | None
-    learning: Learning
+    speeds: dict[tuple[int, int], float]
+    until: int
 
     @property
     def labels(self) -> list[str]:
@@ -173,9 +147,10 @@ def compute_findings(experiment: Experiment) -> Findings:
         results=ranked,
         order=order,
         grid=grid,
-        comparisons=_compare_pairs(ranked[:COMPARED], "scores"),
+        comparisons=_compare_pairs(ranked[:COMPARED]),
         few=_ask_few(ranked),
-        learning=compare_learning(ranked, min(ends)),
+        speeds=compare_speeds(ranked[:COMPARED]),
+        until=min(ends),
     )
 
 
@@ -236,7 +211,6 @@ def _result(
         iqm=Estimate(iqm(final), *iqm_interval(final)),
         band=band,
         seeds=seeds,
-        areas=areas,
         area=interval("mean", areas),
         solving=solving,
     )
@@ -267,14 +241,12 @@ def _rank(result: Result) -> tuple[float, float]:
     return math.inf if math.isnan(mean) else -mean, math.inf if math.isnan(speed) else speed
 
 
-def _compare_pairs(results: Sequence[Result], field: str) -> list[Comparison]:
-    """Compares all pairs by a field [S] of theirs, on the seeds that all of them have."""
-    shared = shared_seeds(results)
+def _compare_pairs(results: Sequence[Result]) -> list[Comparison]:
+    """Compares the scores of all pairs, on the seeds that all of them have."""
+    shared = functools.reduce(np.intersect1d, [each.configuration.seed for each in results])
     if len(results) < 2 or len(shared) < 2:
         return []
-    return compare_all(
-        [getattr(each, field)[np.isin(each.configuration.seed, shared)] for each in results]
-    )
+    return compare_all([each.scores[np.isin(each.configuration.seed, shared)] for each in results])
 
 
 def _ask_few(results: Sequence[Result]) -> Few | None:
@@ -287,29 +259,24 @@ def _ask_few(results: Sequence[Result]) -> Few | None:
     return Few(wrong, seeds_needed(best, second))
 
 
-def compare_learning(results: Sequence[Result], until: int) -> Learning:
-    """Compares how fast results learn; see ``Learning``."""
-    best = results[:COMPARED]
-    return Learning(until, _speeds(best), _compare_pairs(best, "areas"))
+def by_speed(results: Sequence[Result]) -> list[int]:
+    """Returns the places of results by their mean env steps to solve, the fewest first."""
+    means = [float(each.solving.mean.value) for each in results if each.solving is not None]
+    return np.argsort(means, kind="stable").tolist()
 
 
-def fastest(results: Sequence[Result]) -> int:
-    """Returns the place of the result with the fewest mean env steps to solve."""
-    means = [float(each.solving.mean.value) if each.solving else np.inf for each in results]
-    return int(np.argmin(means))
+def compare_speeds(results: Sequence[Result]) -> dict[tuple[int, int], float]:
+    """Returns the p values of the log-rank test of all pairs, by their places, after Holm.
 
-
-def _speeds(results: Sequence[Result]) -> list[SpeedTest]:
+    There are none where no seed solves the task.
+    """
     solving = [each.solving for each in results if each.solving is not None]
+    if not any(each.ever for each in solving):
+        return {}
     pairs = list(itertools.combinations(range(len(solving)), 2))
-    found = [
-        log_rank(solving[i].steps, solving[i].solved, solving[j].steps, solving[j].solved).p_value
-        for i, j in pairs
-    ]
-    return [
-        SpeedTest(i, j, p_value, float(adjusted))
-        for (i, j), p_value, adjusted in zip(pairs, found, holm(found), strict=True)
-    ]
+    times = [(each.steps, each.solved) for each in solving]
+    found = [log_rank(*times[i], *times[j]).p_value for i, j in pairs]
+    return dict(zip(pairs, holm(found).tolist(), strict=True))
 
 
 def swept(findings: Findings) -> list[str]:
@@ -320,11 +287,6 @@ def swept(findings: Findings) -> list[str]:
 def values_of(findings: Findings, name: str) -> list[Any]:
     """Returns the value of a setting in each result."""
     return [each.configuration.settings.get(name) for each in findings.results]
-
-
-def shared_seeds(results: Sequence[Result]) -> np.ndarray:
-    """Returns the numbers of the seeds that all configurations have, ascending."""
-    return functools.reduce(np.intersect1d, [each.configuration.seed for each in results])
 
 
 def worst_seeds(result: Result) -> np.ndarray:

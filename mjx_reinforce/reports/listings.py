@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.reports import words
-from mjx_reinforce.reports.findings import COMPARED, Findings, Result, SpeedTest, worst_seeds
+from mjx_reinforce.reports.findings import COMPARED, Findings, Result, by_speed, worst_seeds
 from mjx_reinforce.reports.words import interval_in_words, number, percent, short_p, steps
 from mjx_reinforce.statistics import Estimate
-from mjx_reinforce.statistics.comparisons import Comparison
 
 #: A table: its ``header``, and ``rows`` of a ``label`` and ``cells``, pairs of a value and what
 #: stands below it. Where the header has a column more, the first is the rank of the row.
@@ -58,34 +57,17 @@ def _results_table(findings: Findings) -> Listing:
 def _speed_table(findings: Findings) -> Listing:
     """Returns the table of who learns faster: the fastest first."""
     compared = findings.results[:COMPARED]
-    if len(compared) < 2:
+    if not findings.speeds:
         return {}
-    header = ["", "configuration"]
-    if findings.experiment.threshold is not None:
-        header += ["steps until half solved", "mean steps to solve", "log-rank p, Holm"]
-    best_area = max(range(len(compared)), key=lambda i: float(compared[i].area.value))
-    order = sorted(range(len(compared)), key=lambda i: _slowness(compared[i]))
-    rows = []
+    order, rows = by_speed(compared), []
     for i in order:
-        each, cells = compared[i], []
-        if (solving := each.solving) is not None:
-            cells += [_cell(solving.median, steps), _cell(solving.mean, steps)]
-            cells.append((_p_against(findings.learning.speeds, i, order[0], "fastest"), ""))
-        cells.append(_cell(each.area))
-        cells.append((_p_against(findings.learning.areas, i, best_area, "greatest"), ""))
+        each, pair = compared[i], (min(i, order[0]), max(i, order[0]))
+        assert each.solving is not None
+        p_value = short_p(findings.speeds[pair]) if i != order[0] else "fastest"
+        cells = [_cell(each.solving.mean, steps), (p_value, ""), _cell(each.area)]
         rows.append(_row(each, cells))
-    return {"header": [*header, "return while training", "p of it, Holm"], "rows": rows}
-
-
-def _slowness(result: Result) -> float:
-    """Returns what orders results, fastest first: steps to solve, or else the falling area."""
-    return float(result.solving.mean.value if result.solving else -result.area.value)
-
-
-def _p_against(tests: Sequence[SpeedTest | Comparison], i: int, best: int, said: str) -> str:
-    """Returns the p value of a result against the best, or what the best is."""
-    found = [each.adjusted for each in tests if {each.first, each.second} == {i, best}]
-    return said if i == best else short_p(found[0]) if found else "none"
+    header = ["", "configuration", "mean steps to solve", "log-rank p, Holm"]
+    return {"header": [*header, "return while training"], "rows": rows}
 
 
 def _against(findings: Findings) -> Listing:

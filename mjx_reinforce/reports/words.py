@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from mjx_reinforce.reports.experiment import counted, ordered, say, setting_in_words
-from mjx_reinforce.reports.findings import COMPARED, Findings, fastest, shared_seeds
+from mjx_reinforce.reports.findings import COMPARED, Findings, by_speed
 from mjx_reinforce.settings.tables import OF_TASKS
 from mjx_reinforce.statistics import Estimate, enough
 from mjx_reinforce.statistics.comparisons import Comparison
@@ -79,7 +79,11 @@ def headline(findings: Findings) -> list[str]:
     bounds = within(best.mean).replace("no interval", f"no interval: {why}")
     mean = f"a mean return of {number(best.mean.value)} ({bounds})"
     if len(findings.results) == 1:
-        return [_learned(findings, mean), *_solving(findings)]
+        seeds, first = counted(len(best.final), "seed"), best.configuration.eval_return[0]
+        first = first[np.isfinite(first)]
+        before = f", from {number(float(first.mean()))} before training" if first.size else ""
+        said = f"{seeds} of {findings.experiment.env} ended with {mean}{before}."
+        return [said, *_solving(findings)]
     name, ties = best.configuration.label, _ties(findings)
     first = f"The greatest mean is that of {name}, which ended with {mean}."
     if findings.comparisons and not ties:
@@ -89,20 +93,6 @@ def headline(findings: Findings) -> list[str]:
     if speed and len(ties) == len(of_best(findings)):
         return [f"{speed}; the final returns are a tie.", *said]
     return [*said, f"{speed}."] if speed else said
-
-
-def _learned(findings: Findings, mean: str) -> str:
-    """Returns what the seeds of one configuration learned."""
-    best, env = findings.results[0], findings.experiment.env
-    seeds = counted(len(best.final), "seed")
-    who = f"{seeds} of {env} were trained"
-    if best.solving and best.solving.ever:
-        who = f"{best.solving.ever:,} of {seeds} learned to solve {env}"
-    first = best.configuration.eval_return[0]
-    if best.configuration.env_steps[0].any() or not np.isfinite(first).any():
-        return f"{who}. They ended with {mean}."
-    untrained = float(first[np.isfinite(first)].mean())
-    return f"{who}. The return went from {number(untrained)} before training to {mean}."
 
 
 def _ties(findings: Findings) -> list[Comparison]:
@@ -125,13 +115,12 @@ def _ahead(findings: Findings) -> Iterator[str]:
     )
     if ties:
         least = p_value(min(each.adjusted for each in ties))
-        seeds = len(shared_seeds(findings.results[:COMPARED]))
-        why = "a difference as large comes by chance too often"
-        if len(findings.comparisons) * 2.0 ** (1 - seeds) >= LEVEL:
-            why = f"{counted(seeds, 'seed')} are too few to tell, whatever they say"
         least += "" if least == "p = 1" else " or more"
         names = _listed([findings.labels[each.second] for each in ties])
-        yield f"It cannot be told from {names}: {why} ({least})."
+        yield (
+            f"It cannot be told from {names}: a difference as large comes by chance too often "
+            f"({least})."
+        )
 
 
 def _listed(names: list[str]) -> str:
@@ -165,16 +154,12 @@ def _few(findings: Findings) -> Iterator[str]:
 
 def _speed(findings: Findings) -> str:
     """Returns what surely solves the task sooner than others, by the log-rank test, or nothing."""
-    names = findings.labels[:COMPARED]
-    first = fastest(findings.results[:COMPARED])
-    slower = [
-        names[each.first + each.second - first]
-        for each in findings.learning.speeds
-        if first in (each.first, each.second) and each.adjusted < LEVEL
-    ]
+    names, order = findings.labels[:COMPARED], by_speed(findings.results[:COMPARED])
+    pairs = findings.speeds.items()
+    slower = [names[sum(pair) - order[0]] for pair, p in pairs if order[0] in pair and p < LEVEL]
     if slower and len(slower) == len(names) - 1:
-        return f"Fastest is {names[first]}"
-    return f"{names[first]} is surely faster than {_listed(slower)}" if slower else ""
+        return f"Fastest is {names[order[0]]}"
+    return f"{names[order[0]]} is surely faster than {_listed(slower)}" if slower else ""
 
 
 def caveats(findings: Findings) -> Iterator[str]:
