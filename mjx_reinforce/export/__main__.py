@@ -40,15 +40,14 @@ def export(settings: ExportSettings) -> list[Path]:
       OSError: a file cannot be written.
     """
     run = read_run(settings.run)
-    from mjx_reinforce.export.arithmetic import arithmetic, numpy_source
+    from mjx_reinforce.export.arithmetic import numpy_policy
     from mjx_reinforce.export.player import load_seed
     from mjx_reinforce.files import write_arrays, write_bytes
 
     player, saved = load_seed(run, settings.seed, settings.which)
     outputs = output_files(settings, run, player.seed)
-    plain = arithmetic(saved)
-    write_arrays(outputs[0], plain.arrays)
-    source = numpy_source(plain, outputs[0].stem, player.env, player.seed)
+    arrays, source = numpy_policy(saved, outputs[0].stem, player.env, player.seed)
+    write_arrays(outputs[0], arrays)
     write_bytes(outputs[1], source.encode())
     return outputs
 

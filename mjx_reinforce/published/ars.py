@@ -1,11 +1,11 @@
 """Augmented random search (Mania, Guy and Recht 2018, arXiv:1803.07055), algorithms 1 and 2.
 
 A direction delta is tried forwards and backwards by two deterministic policies of their own, and
-the parameters move along the directions that made a difference:
+the parameters move along the D directions that made a difference:
 
-    theta += step_size / (b sigma) * sum over the b best of (r_plus - r_minus) delta,
+    theta += step_size / (D sigma) * sum of (r_plus - r_minus) delta,
 
-with sigma the standard deviation of those 2 b returns. An episode in which the simulation left the
+with sigma the standard deviation of those 2 D returns. An episode in which the simulation left the
 finite numbers counts as the worst of the others; where all did, nothing is learned. No gradient of
 the policy is taken. The learner has the same functions as that of ``reinforce``, so whatever drives
 one drives the other.
@@ -30,7 +30,6 @@ from mjx_reinforce.engine.play.rollouts import episode_returns
 from mjx_reinforce.learning import contract, normalize
 from mjx_reinforce.learning.estimators import replace_broken
 from mjx_reinforce.learning.learner import Metrics, first_actor, keep_finite, update_metrics
-from mjx_reinforce.learning.updates import signal_to_noise
 
 #: (directions, like the params with a leading axis [D]; returns [2, D] forwards and backwards;
 #: noise_std) -> what the parameters move by, over the step size.
@@ -53,7 +52,6 @@ def ars(
     *,
     policy: mr.Policy | None = None,
     num_directions: int = 8,
-    top_directions: int | None = None,
     step_size: float | jax.Array = 0.02,
     noise_std: float | jax.Array = 0.03,
     increment: Increment | None = None,
@@ -69,11 +67,9 @@ def ars(
       policy: whose mode plays; by default linear and zero. All its params are searched, so it
         should have none that the mode does not read.
       num_directions: D, directions tried in an update, by two episodes each.
-      top_directions: b, how many of them count, those with the greatest of their two returns
-        (V1-t, V2-t); by default all (V1, V2).
       step_size: alpha.
       noise_std: nu, how far along a direction the policies are.
-      increment: in place of the paper's sum over the b best.
+      increment: in place of the paper's sum.
       horizon: T, steps after which an episode ends; by default ``env.max_episode_steps``.
       normalize_steps: scale observations by the mean and std of about the first so many steps;
         inf is V2, 0 is V1.
@@ -97,10 +93,6 @@ def ars(
     """
     check_environment(env)
     check_count("num_directions", num_directions)
-    top = num_directions if top_directions is None else top_directions
-    check_count("top_directions", top)
-    if top > num_directions:
-        raise ValueError(f"top_directions must lie in [1, {num_directions}], got {top}")
     check_number("step_size", step_size, positive=True)
     check_number("noise_std", noise_std, positive=True)
     check_number("normalize_steps", normalize_steps, finite=False)
@@ -113,7 +105,7 @@ def ars(
         num_directions=num_directions,
         step_size=step_size,
         noise_std=noise_std,
-        increment=functools.partial(_of_the_best, top) if increment is None else increment,
+        increment=mean_difference if increment is None else increment,
         horizon=contract.check_horizon(env, horizon),
         normalize_limits=(normalize_steps, normalize_min_std),
         engine=choose(engine, env),
@@ -204,11 +196,6 @@ class _Search:
             "gradient_norm": optax.tree.norm(step),
             "return_std": jnp.std(returns),
         }
-        if self.num_directions > 1:
-            # Of the mean over all directions, also where the step is of the best alone.
-            each = jax.vmap(optax.tree.scale)(returns[0] - returns[1], trial.directions)
-            mean = jax.tree.map(lambda x: jnp.mean(x, axis=0), each)
-            measured["gradient_snr"] = signal_to_noise(mean, each, self.num_directions)
         return after, update_metrics(played, skipped, measured)
 
 
@@ -228,12 +215,11 @@ def _join(played: mr.Trajectory) -> mr.Trajectory:
     )
 
 
-def _of_the_best(top: int, directions: Any, returns: jax.Array, noise_std: Any) -> Any:
-    """Returns the sum in the module's formula over b sigma; zero where sigma is."""
+def mean_difference(directions: Any, returns: jax.Array, noise_std: Any) -> Any:
+    """Returns the sum in the module's formula over D sigma; zero where sigma is."""
     del noise_std
-    best = jnp.argsort(-jnp.max(returns, axis=0))[:top]
-    gain = over_std(returns[0, best] - returns[1, best], returns[:, best]) / top
-    along = jax.vmap(optax.tree.scale)(gain, jax.tree.map(lambda d: d[best], directions))
+    gain = over_std(returns[0] - returns[1], returns) / returns.shape[1]
+    along = jax.vmap(optax.tree.scale)(gain, directions)
     return jax.tree.map(lambda x: jnp.sum(x, axis=0), along)
 
 

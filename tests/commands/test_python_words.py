@@ -75,7 +75,7 @@ def test_a_learner_is_refused(message, monkeypatch):
         (lambda: m.reinforce(Survive), "Survive is a class, no environment yet: call it"),
         (lambda: m.ars(ENV, policy=m.mlp_policy(3, NORMAL)), "policy.apply"),
         (lambda: m.ars(ENV, num_directions=True), "num_directions must be a whole number, got T"),
-        (lambda: m.ars(ENV, top_directions=2.5), "top_directions must be a whole number.* got 2.5"),
+        (lambda: m.ars(ENV, num_directions=2.5), "num_directions must be a whole number.* got 2.5"),
         (lambda: m.ars(ENV, step_size=NAN), "step_size must be positive and finite, got nan"),
         (lambda: m.reward_to_go(NAN), r"must lie in \[0, 1\], got nan"),
         (lambda: m.leave_one_out(ENV), r"must lie in \[0, 1\], got <toys.Survive"),

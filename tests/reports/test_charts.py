@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 from fake_sweeps import make_sweep
 from pages import findings_of
@@ -54,16 +55,22 @@ def test_without_a_threshold_nothing_is_solved(found):
     without = findings.compute_findings(experiment)
     assert [name for _, name in numbers(without)][:3] == ["final", "curves", "distribution"]
     assert all("solved" not in json.dumps(each.spec) for each in draw_charts(without))
-    assert charts.threshold_line(without, "x") == []
+    assert charts.threshold_line(without, "x", np.arange(2000)) == []
 
 
-def test_a_threshold_far_above_all_returns_squeezes_no_figure(found, drawn):
+def test_axes_end_where_the_data_do(found, drawn):
+    """A threshold beyond what a figure shows is not drawn."""
+    finals = np.concatenate([each.final for each in found.results])
+    for threshold, inside in ((-1e9, False), (np.nanmedian(finals), True), (1e9, False)):
+        experiment = found.experiment._replace(threshold=float(threshold))
+        other = found._replace(experiment=experiment)
+        assert bool(charts.threshold_line(other, "x", finals)) == inside
     far = findings.compute_findings(found.experiment._replace(threshold=123_456.0))
     made = {each.name: each for each in draw_charts(far)}
     assert "solved" not in made
     assert "123456" not in json.dumps([each.spec for each in made.values()])
-    assert "123,456.0, lies above the figure" in made["curves"].caption
-    assert "lies above" not in drawn["curves"].caption
+    assert "123,456.0, lies beyond the figure" in made["curves"].caption
+    assert "lies beyond" not in drawn["curves"].caption
 
 
 def test_defaults_are_named_where_settings_are_compared(found):

@@ -261,21 +261,13 @@ def moment_line(findings: Findings) -> Spec:
     }
 
 
-def threshold_of(findings: Findings) -> float | None:
-    """Returns the return that counts as solved, None where it would squeeze all that is drawn."""
-    threshold = findings.experiment.threshold
-    returns = [each.configuration.eval_return.ravel() for each in findings.results]
-    known = np.concatenate(returns)
-    known = known[np.isfinite(known)]
-    if threshold is None or not known.size or threshold - known.max() > 0.5 * np.ptp(known):
-        return None
-    return threshold
+def threshold_line(findings: Findings, axis: str, drawn: np.ndarray) -> list[Spec]:
+    """Returns the line at the return that counts as solved, and its name.
 
-
-def threshold_line(findings: Findings, axis: str) -> list[Spec]:
-    """Returns the line at the return that counts as solved, and its name."""
-    threshold = threshold_of(findings)
-    if threshold is None:
+    There is none beyond the returns that are drawn: axes end where the data do.
+    """
+    threshold, known = findings.experiment.threshold, drawn[np.isfinite(drawn)]
+    if threshold is None or not known.size or not known.min() <= threshold <= known.max():
         return []
     # Below the line, at its end: curves come from below and end above.
     at_end, look = {"x": {"value": {"expr": "width - 4"}}}, {"baseline": "top", "dy": 5}

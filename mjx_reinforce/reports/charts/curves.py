@@ -19,15 +19,17 @@ _DRAWN_OF_ALL = 480
 def draw(findings: Findings) -> Iterator[charts.Chart]:
     """Yields the chart."""
     threshold, beyond = findings.experiment.threshold, ""
-    if threshold is not None and charts.threshold_of(findings) is None:
-        beyond = f" The return that counts as solved, {number(threshold)}, lies above the figure."
+    returns = [each.configuration.eval_return.ravel() for each in findings.results]
+    solved = charts.threshold_line(findings, "y", np.concatenate(returns))
+    if threshold is not None and not solved:
+        beyond = f" The return that counts as solved, {number(threshold)}, lies beyond the figure."
     layers = [
         {
             "encoding": {"x": charts.STEPS, "color": charts.series(findings.labels)},
             "layer": [_lines_of_seeds(), _band_and_line(findings)],
         },
         charts.moment_line(findings),
-        *charts.threshold_line(findings, "y"),
+        *solved,
     ]
     yield charts.make_chart(
         findings,

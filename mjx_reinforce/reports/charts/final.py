@@ -17,10 +17,11 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
     if len(results) == 1:
         return
     places = list(range(len(results)))
+    finals = np.concatenate([each.final for each in results])
     tenths = np.transpose([np.quantile(each.scores, [0.1, 0.9]) for each in results])
     yield charts.make_chart(
         findings,
-        [_rows(findings), *charts.threshold_line(findings, "x")],
+        [_rows(findings), *charts.threshold_line(findings, "x", finals)],
         42 * len(results) + 10,
         name="final",
         title="The final return",

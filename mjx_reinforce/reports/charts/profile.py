@@ -26,7 +26,7 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
     lines = charts.share_layers(findings, "profile", x, "seeds above it", said)
     yield charts.make_chart(
         findings,
-        [lines, *charts.threshold_line(findings, "x")],
+        [lines, *charts.threshold_line(findings, "x", finals)],
         320,
         name="profile",
         title="Performance profiles",
