@@ -95,7 +95,7 @@ print(f"return {results.eval_return[0].mean():.1f} at first, {results.test_retur
 # %% [markdown]
 # ## Look at it
 #
-# The policy plays four episodes. How far is the tip from the target?
+# The policy plays 64 episodes. How far is the tip from the target?
 
 # %%
 env = mr.envs.make("Arm-v0")

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # A minute on each task
 #
-# By default, a task trains for about a minute on two cores or on a GPU, or for less where more does not help. Here each
-# task trains two seeds. Compiling comes on top.
+# By default, a task trains for about a minute on two cores or on a GPU; easy tasks need less. Here each task trains two
+# seeds. The time for compiling comes on top.
 
 # %%
 import time

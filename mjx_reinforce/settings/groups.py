@@ -107,7 +107,7 @@ class RunSettings:
     many env steps fit. config.json keeps that number, so --like RUN repeats the run to the bit. If
     episodes get longer, the run ends early."""
     max_updates: int | None = setting(None, *TOTAL, Mark.BUDGET, Mark.NOT_COMPILED)
-    """Stop every seed after this many updates; with --num-episodes 1, as many episodes."""
+    """Stop every seed after this many updates. With --num-episodes 1, these are episodes."""
     num_episodes: int = _for_gradients(16, *COUNT)
     """Episodes per update and seed."""
     horizon: int | None = setting(None, *COUNT)
@@ -238,7 +238,7 @@ class CheckpointSettings:
         None, *COUNT, Mark.BUDGET, Mark.NOT_COMPILED, once="it is saved as a whole"
     )
     """Updates between checkpoints, from which --resume continues; about a minute if not given.
-    They are written after evaluations."""
+    They follow evaluations."""
     resume: Path | None = setting(None, Mark.PLACE, once="it goes on as a whole")
     """Resume the run in this directory, with its own settings. Only the budget may change:
     --env-steps, --minutes, --max-updates, --checkpoint-every. Name your own code, module:Class or

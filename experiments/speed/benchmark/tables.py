@@ -148,8 +148,8 @@ def words(raw: Raw) -> str:
         equal.append((task, double, c_mujoco))
     return textwrap.fill(
         "On two cores `native` plays the first six tasks below at "
-        f"{span('the speed of C MuJoCo', equal)} in equal precision, and at "
-        f"{span('its speed', single)} in float32, which is what it trains in; on the GPU at "
+        f"{span('the speed of C MuJoCo', equal)} in equal precision. In float32, in which it "
+        f"trains, that is {span('its speed', single)}. On the GPU it is "
         f"{span('the speed of MuJoCo Warp', warp)}.",
         110,
     )

@@ -27,12 +27,9 @@ def draw(folder: Path, docs: Path, path: Path) -> None:
     found, others = kept.curves(folder), kept.peers(docs / "peers.csv")
     tasks = list(dict.fromkeys(group.task for group in kept.clock(folder)))
     rows = -(-len(tasks) // _COLUMNS)
-    size = 1 + 3.1 * min(len(tasks), _COLUMNS), 0.6 + 2.7 * rows
-    figure = Figure(figsize=size, dpi=100, layout="constrained")
-    axes = figure.subplots(rows, min(len(tasks), _COLUMNS), squeeze=False).ravel()
-    for ax in axes[len(tasks) :]:
-        ax.set_axis_off()
-    for ax, task in zip(axes, tasks, strict=False):
+    figure = Figure(figsize=(13.4, 0.6 + 2.7 * rows), dpi=100, layout="constrained")
+    for number, task in enumerate(tasks, 1):
+        ax = figure.add_subplot(rows, _COLUMNS, number)
         for (name, device), curve in found.items():
             if name == task:
                 color = _CPU if "threads" in device else _GPU
@@ -47,8 +44,12 @@ def draw(folder: Path, docs: Path, path: Path) -> None:
                 means = [np.mean(values) for values in budgets.values()]
                 marker = "os"[PEERS.index(peer)]
                 ax.plot(list(budgets), means, marker, color=_PEER, markersize=5)
-        ax.set(title=task, xscale="log", xlabel="seconds of training")
-    axes[0].set_ylabel("return without noise")
+        ax.set(title=task, xlabel="seconds of training")
+        ax.set_xscale("log", subs=[2, 5])
+        ax.xaxis.set_major_formatter("{x:g}")
+        ax.xaxis.set_minor_formatter("{x:g}")
+        ax.tick_params(axis="x", which="both", labelsize=8)
+    figure.axes[0].set_ylabel("return without noise")
     shown = {
         "one GPU, all seeds together": Line2D([], [], color=_GPU),
         "two threads, one seed": Line2D([], [], color=_CPU),
@@ -57,7 +58,6 @@ def draw(folder: Path, docs: Path, path: Path) -> None:
         "Stable-Baselines3 PPO": Line2D([], [], color=_PEER, marker="o", linestyle=""),
         "and SAC, two threads": Line2D([], [], color=_PEER, marker="s", linestyle=""),
     }
-    where = {"loc": "outside lower center", "ncols": 6, "frameon": False}
-    figure.legend(list(shown.values()), list(shown), **where)
+    figure.legend(shown.values(), shown, loc="outside lower center", ncols=6, frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_picture(figure, path)
