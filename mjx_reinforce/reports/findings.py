@@ -90,7 +90,7 @@ class Few(NamedTuple):
     """What a comparison of the two best with few seeds would have said.
 
     wrong: how often the mean of so many seeds names the other one, by the number of seeds
-    needed: seeds of each with which a test finds the difference four times of five, if any do
+    needed: seeds of each with which a test finds the difference four times out of five, if any do
     """
 
     wrong: dict[int, float]

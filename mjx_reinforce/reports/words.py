@@ -148,7 +148,7 @@ def _few(findings: Findings) -> Iterator[str]:
         found = f"{few.needed:,} of each would" if few.needed else "10,000 of each would not"
         yield (
             f"With few seeds, the next would have looked better than the best {', '.join(each)}; "
-            f"{found} find it four times of five."
+            f"{found} find it four times out of five."
         )
 
 

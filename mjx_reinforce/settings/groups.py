@@ -79,7 +79,7 @@ class RunSettings:
     """Environment id, or module:Class for your own environment. `python -m mjx_reinforce.envs`
     lists the ids."""
     env_set: tuple[str, ...] = ()
-    """Settings of the environment, such as frame_skip=4. `envs ID` lists them."""
+    """Settings of the environment, such as frame_skip=4; see `python -m mjx_reinforce.envs ID`."""
     algorithm: str = "reinforce"
     """reinforce follows the policy gradient; ars is augmented random search (Mania et al. 2018); a
     preset's name is its program without its settings. Or module:name."""
@@ -89,7 +89,7 @@ class RunSettings:
         None, Mark.NOT_COMPILED, once="every configuration has the same seeds"
     )
     """FIRST:END, in place of --num-seeds: seeds FIRST to END - 1, a share of a larger run, for one
-    of several machines. `report A B` joins shares."""
+    of several machines. `python -m mjx_reinforce.report A B` joins shares."""
     seed: int = setting(
         0,
         Range.SEED,
