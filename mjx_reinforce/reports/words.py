@@ -85,7 +85,7 @@ def headline(findings: Findings) -> list[str]:
         said = f"{seeds} of {findings.experiment.env} ended with {mean}{before}."
         return [said, *_solving(findings)]
     name, ties = best.configuration.label, _ties(findings)
-    first = f"The greatest mean is that of {name}, which ended with {mean}."
+    first = f"Best by the mean is {name}: it ended with {mean}."
     if findings.comparisons and not ties:
         first = f"The best is {name}: it ended with {mean}."
     said = [first, *_ahead(findings), *_solving(findings), *_few(findings)]
@@ -118,7 +118,7 @@ def _ahead(findings: Findings) -> Iterator[str]:
         least += "" if least == "p = 1" else " or more"
         names = _listed([findings.labels[each.second] for each in ties])
         yield (
-            f"It cannot be told from {names}: a difference as large comes by chance too often "
+            f"The best cannot be told from {names}: chance often makes a difference as large "
             f"({least})."
         )
 
