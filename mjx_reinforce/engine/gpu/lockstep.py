@@ -57,9 +57,7 @@ class Lockstep(LLVM):
         with self._going_through(gate.body):
             return super().gate(gate, values)
 
-    def loop(
-        self, loop: LiveLoop, values: dict[Node, Value]
-    ) -> tuple[Sequence[Value], Sequence[Sequence[Value]]]:
+    def loop(self, loop: LiveLoop, values: dict[Node, Value]) -> Sequence[Value]:
         """Writes a loop: a long one goes on for all threads until none needs it."""
         with self._going_through(loop.body):
             return super().loop(loop, values)

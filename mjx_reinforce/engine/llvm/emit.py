@@ -145,9 +145,7 @@ class LLVM(Backend[Value]):
         }
         return [chosen.get(out.leaf) or self._stored[cast(Node, out.hot)] for out in gate.outs]
 
-    def loop(
-        self, loop: LiveLoop, values: dict[Node, Value]
-    ) -> tuple[Sequence[Value], Sequence[Sequence[Value]]]:
+    def loop(self, loop: LiveLoop, values: dict[Node, Value]) -> Sequence[Value]:
         """Writes a loop, which ends when no lane goes on or its length is reached."""
         text = self._text
         known = self._in_place(loop, values)
@@ -194,13 +192,10 @@ class LLVM(Backend[Value]):
             super(LLVM, self).value(carry.next, inner) if at_least_once else known[carry.leaf]
             for carry in loop.carries
         ]
-        return ends, [
-            [
-                Memory(self._text.at(array, r.value.dtype, t), r.value.dtype)
-                for t in range(len(r.outs))
-            ]
-            for r, array in zip(loop.records, kept, strict=True)
-        ]
+        for record, array in zip(loop.records, kept, strict=True):
+            dtype = record.value.dtype
+            ends += [Memory(text.at(array, dtype, t), dtype) for t in range(len(record.outs))]
+        return ends
 
     def _in_place(self, loop: LiveLoop, values: dict[Node, Value]) -> dict[Node, Value]:
         """Writes the starts of the carries that change in place; returns where each leaf lies.

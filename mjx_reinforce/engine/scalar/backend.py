@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive
 from mjx_reinforce.engine.scalar.nodes import Call, Node, Scalar, is_constant
-from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop, Schedule
+from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop, Schedule, results
 
 #: What a backend makes of a scalar: a lane, the name of a variable, ...
 Value = TypeVar("Value")
@@ -44,12 +44,10 @@ class Backend(abc.ABC, Generic[Value]):
         """Returns a value for each of the gate's outs."""
 
     @abc.abstractmethod
-    def loop(
-        self, loop: LiveLoop, values: dict[Node, Value]
-    ) -> tuple[Sequence[Value], Sequence[Sequence[Value]]]:
-        """Returns the final value of each carry, and each record's value in each iteration."""
+    def loop(self, loop: LiveLoop, values: dict[Node, Value]) -> Sequence[Value]:
+        """Returns the final value of each carry, then each record's in each iteration."""
 
-    def call(self, call: Call, values: dict[Node, Value]) -> Sequence[Sequence[Value]]:
+    def call(self, call: Call, values: dict[Node, Value]) -> Sequence[Value]:
         """Returns the value of each element of each result of an operation that stays whole."""
         raise UnsupportedPrimitive(f"it has no operation {call.name!r}")
 
@@ -66,20 +64,16 @@ class Backend(abc.ABC, Generic[Value]):
     def run(self, schedule: Schedule, values: dict[Node, Value]) -> None:
         """Adds to the values what the steps of a schedule compute."""
         for step in schedule:
-            if isinstance(step, LiveLoop):
-                carries, records = self.loop(step, values)
-                values.update(zip((carry.out for carry in step.carries), carries, strict=True))
-                for record, kept in zip(step.records, records, strict=True):
-                    values.update(zip(record.outs, kept, strict=True))
-            elif isinstance(step, Call):
-                for leaves, made in zip(step.outs, self.call(step, values), strict=True):
-                    values.update(zip(leaves, made, strict=False))
-            elif isinstance(step, LiveGate):
-                values.update(
-                    zip((out.leaf for out in step.outs), self.gate(step, values), strict=True)
-                )
-            else:
+            if isinstance(step, Node):
                 values[step] = self.node(step, [self.value(arg, values) for arg in step.args])
+                continue
+            if isinstance(step, LiveLoop):
+                made = self.loop(step, values)
+            else:
+                made = (
+                    self.call(step, values) if isinstance(step, Call) else self.gate(step, values)
+                )
+            values.update(zip(results(step), made, strict=True))
 
     def inside(
         self, body: Schedule, values: dict[Node, Value], known: Mapping[Node, Value] | None = None

@@ -152,7 +152,7 @@ class XLA(Backend[Any]):
 
         return lax.cond(predicate, hot, lambda: cold)
 
-    def loop(self, loop: LiveLoop, values: Values) -> tuple[list[Any], list[Any]]:
+    def loop(self, loop: LiveLoop, values: Values) -> list[Any]:
         """Emits a ``fori_loop``, a ``scan`` or a ``while_loop``."""
         init = [self._materialize(c.init, c.out.varying, values) for c in loop.carries]
         body = functools.partial(self._iteration, loop, values)
@@ -162,11 +162,9 @@ class XLA(Backend[Any]):
                 for e in loop.elements
             ]
             final, stacked = lax.scan(body, init, rows, length=loop.length)
-            return final, [
-                [kept[t] for t in range(len(record.outs))]
-                for record, kept in zip(loop.records, stacked, strict=True)
-            ]
-        return self._repeat(loop, body, init), []
+            each = zip(loop.records, stacked, strict=True)
+            return [*final, *(kept[t] for x, kept in each for t in range(len(x.outs)))]
+        return self._repeat(loop, body, init)
 
     def _iteration(
         self, loop: LiveLoop, values: Values, carry: list[Any], row: Sequence[Any] = ()

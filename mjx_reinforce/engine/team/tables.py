@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from mjx_reinforce.engine.base import MjModel
+from mjx_reinforce.engine.physics.mjx_internals import geom_pairs
 from mjx_reinforce.engine.scalar import UnsupportedPrimitive
 
 _C: Any = mujoco  # a C extension without stubs
@@ -155,7 +156,7 @@ def _lacking_contacts(m: Any) -> Iterable[tuple[str, Any]]:
     sticks = (m.geom_adhesion, m.geom_surfacevel, m.pair_adhesion)
     yield "adhesion or moving surfaces", any(np.any(x) for x in sticks)
     items = 0
-    for a, b in (*_meeting(m), *_given_pairs(m)):
+    for a, b, _ in _meeting(m):
         kinds = _kinds(m, a, b)
         names = [_GEOM(x).name.removeprefix("mjGEOM_").lower() for x in kinds]
         yield f"a {names[1]} that meets a {names[0]}", kinds not in _PARTS
@@ -168,31 +169,13 @@ def _kinds(m: Any, a: int, b: int) -> tuple[int, int]:
     return int(m.geom_type[a]), int(m.geom_type[b])
 
 
-def _given_pairs(m: Any) -> Iterable[tuple[int, int]]:
-    """Yields the geoms of the pairs that a model names, the flatter first."""
-    for g, h in zip(m.pair_geom1.tolist(), m.pair_geom2.tolist(), strict=True):
-        a, b = sorted((g, h), key=lambda x: (m.geom_type[x], x))
-        yield a, b
+def _meeting(m: Any) -> list[tuple[int, ...]]:
+    """Returns the pairs of geoms that may meet, the flatter first, those of C's own choice first.
 
-
-def _meeting(m: Any) -> Iterable[tuple[int, int]]:
-    """Yields the pairs of geoms that C lets collide by itself, the flatter first."""
-    given = {frozenset(x) for x in zip(m.pair_geom1, m.pair_geom2, strict=True)}
-    excluded = set(np.asarray(m.exclude_signature).tolist())
-    types, affinity, body = m.geom_contype, m.geom_conaffinity, m.geom_bodyid
-    weld = m.body_weldid[body]
-    parent = m.body_weldid[m.body_parentid[weld]]
-    for g in range(m.ngeom):
-        h = np.arange(g + 1, m.ngeom)
-        masks = (types[g] & affinity[h]) | (types[h] & affinity[g])
-        kin = (parent[g] == weld[h]) | (parent[h] == weld[g])
-        apart = (weld[g] != weld[h]) & ~(kin & (weld[g] > 0) & (weld[h] > 0))
-        for other in h[apart & (masks != 0)].tolist():
-            first, second = sorted((int(body[g]), int(body[other])))
-            a, b = sorted((g, other), key=lambda x: (m.geom_type[x], x))
-            skipped = first << 16 | second in excluded or frozenset((a, b)) in given
-            if not skipped and m.geom_type[b] != _PLANE:
-                yield a, b
+    The third number is that of the pair that the model names, -1 for the others.
+    """
+    pairs = ((int(n), *sorted((int(g), int(h)))) for g, h, n in geom_pairs(m))
+    return [(*sorted(x, key=m.geom_type.__getitem__), n) for n, *x in sorted(pairs)]
 
 
 def _times(a: Any, b: Any) -> np.ndarray:
@@ -470,12 +453,7 @@ class _Tables:
     def _pairs(self, near: int) -> None:
         """Makes the tables of geoms that may meet."""
         m = self.m
-        found = [(g, h, self._pair_of_geoms(g, h)) for g, h in _meeting(m)]
-        for n, (g, h) in enumerate(_given_pairs(m)):
-            friction = np.array(m.pair_friction[n])
-            soft = self._soft(m.pair_solref[n], m.pair_solimp[n])
-            pair = (int(m.pair_dim[n]), float(m.pair_margin[n]), friction, soft)
-            found.append((g, h, pair))
+        found = [(g, h, self._pair(g, h, n)) for g, h, n in _meeting(m)]
         used = sorted({g for a, b, _ in found for g in (a, b)})
         number = {g: n for n, g in enumerate(used)}
         kinds: dict[tuple, int] = {}
@@ -516,9 +494,15 @@ class _Tables:
         self.reals |= {"geom_turn": turns if box.any() else []}
         self.reals |= {"geom_size": size if box.any() else []}
 
-    def _pair_of_geoms(self, g: int, h: int) -> tuple[int, float, np.ndarray, int]:
-        """Returns condim, margin, friction [5] and softness of contacts, as C mixes them."""
+    def _pair(self, g: int, h: int, n: int) -> tuple[int, float, np.ndarray, int]:
+        """Returns condim, margin, friction [5] and softness of contacts, as C mixes them.
+
+        ``n`` is the number of the model's own pair, -1 for none.
+        """
         m, geoms = self.m, [g, h]
+        if n >= 0:
+            soft = self._soft(m.pair_solref[n], m.pair_solimp[n])
+            return int(m.pair_dim[n]), float(m.pair_margin[n]), m.pair_friction[n], soft
         priority = m.geom_priority[geoms]
         first = priority[0] > priority[1]
         if priority[0] != priority[1]:

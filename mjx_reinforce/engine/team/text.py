@@ -185,9 +185,7 @@ class CText(Backend[str]):
             self._written.update({out.leaf: Place(array, k) for k, out in enumerate(outs)})
         return [self.leaf(out.leaf) for out in gate.outs]
 
-    def loop(
-        self, loop: LiveLoop, values: dict[Node, str]
-    ) -> tuple[Sequence[str], Sequence[Sequence[str]]]:
+    def loop(self, loop: LiveLoop, values: dict[Node, str]) -> Sequence[str]:
         """Writes a loop."""
         known, names, kept = {}, [], []
         for carry in loop.carries:
@@ -214,12 +212,10 @@ class CText(Backend[str]):
                 self.line(f"const {kind} {following} = {self.get(carry.next)};")
         self.lines += [f"{name} = {x};" for name, x in zip(names, nexts, strict=True)]
         self.lines += ["t.sync();", "}"]  # the next round may write what this one reads
-        return names, [
-            [f"{array}[{t}]" for t in range(len(record.outs))]
-            for record, array in zip(loop.records, kept, strict=True)
-        ]
+        each = zip(loop.records, kept, strict=True)
+        return [*names, *(f"{array}[{t}]" for x, array in each for t in range(len(x.outs)))]
 
-    def call(self, call: Call, values: dict[Node, str]) -> Sequence[Sequence[str]]:
+    def call(self, call: Call, values: dict[Node, str]) -> Sequence[str]:
         """Writes an operation of the device code."""
         if call.name in _SIMULATES:
             self._simulate(call)
@@ -227,10 +223,8 @@ class CText(Backend[str]):
             self._layer(call)
         else:
             return super().call(call, values)
-        return [
-            [f"{self._arrays[call, number]}[{k}]" for k in range(len(out))]
-            for number, out in enumerate(call.outs)
-        ]
+        arrays = enumerate(call.outs)
+        return [f"{self._arrays[call, n]}[{k}]" for n, out in arrays for k in range(len(out))]
 
     # -------------------------------------------------------------------- what is written before
 
@@ -248,7 +242,7 @@ class CText(Backend[str]):
         self._prepared |= seen
 
     def _write(self, step: LiveGate | LiveLoop | Call) -> None:
-        depth = _results(step)[0].scope.depth
+        depth = liveness.results(step)[0].scope.depth
         needs = [x for x in liveness.reads([step]) if x.scope.depth <= depth]
         self._prepare(needs)
         if isinstance(step, LiveLoop):  # so that no round of it computes them again
@@ -474,14 +468,4 @@ class CText(Backend[str]):
 
 def _owners(body: Schedule) -> dict[Node, LiveGate | LiveLoop | Call]:
     """Returns the steps of a body by the nodes that stand for their results."""
-    return {leaf: x for x in body if not isinstance(x, Node) for leaf in _results(x)}
-
-
-def _results(step: LiveGate | LiveLoop | Call) -> list[Node]:
-    """Returns the nodes that stand for the results of a step."""
-    if isinstance(step, LiveGate):
-        return [out.leaf for out in step.outs]
-    if isinstance(step, LiveLoop):
-        outs = [carry.out for carry in step.carries]
-        return [*outs, *(x for record in step.records for x in record.outs)]
-    return [x for out in step.outs for x in out]
+    return {leaf: x for x in body if not isinstance(x, Node) for leaf in liveness.results(x)}

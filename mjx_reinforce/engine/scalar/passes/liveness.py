@@ -106,6 +106,16 @@ class LiveLoop:
 Schedule = list[Node | LiveGate | LiveLoop | Call]
 
 
+def results(step: LiveGate | LiveLoop | Call) -> list[Node]:
+    """Returns the nodes that stand for the results of a step."""
+    if isinstance(step, LiveGate):
+        return [out.leaf for out in step.outs]
+    if isinstance(step, Call):
+        return [x for out in step.outs for x in out]
+    outs = [carry.out for carry in step.carries]
+    return [*outs, *(x for record in step.records for x in record.outs)]
+
+
 def nodes(body: Schedule) -> Iterator[Node]:
     """Yields the nodes of a schedule, also inside of its loops and gates."""
     return (step for step in _flat(body) if isinstance(step, Node))
