@@ -12,8 +12,7 @@ from mjx_reinforce.engine.llvm.lanes import Lanes
 from mjx_reinforce.engine.llvm.operations import OPERATIONS
 from mjx_reinforce.engine.llvm.text import Text, literal
 from mjx_reinforce.engine.scalar.backend import Backend
-from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive
-from mjx_reinforce.engine.scalar.nodes import Captured, Node, Op, Scalar, is_constant
+from mjx_reinforce.engine.scalar.nodes import Node, Op, Scalar, is_constant
 from mjx_reinforce.engine.scalar.passes import liveness
 from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop, Schedule
 
@@ -86,8 +85,6 @@ class LLVM(Backend[Value]):
 
     def leaf(self, node: Node) -> Value:
         """An input stays in memory."""
-        if isinstance(node.owner, Captured):
-            raise UnsupportedPrimitive("it needs an array of an outer transformation")
         number, position = node.position
         pointer, dtype, align = self._inputs(number)
         align = math.gcd(align, dtype.itemsize * position)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from mjx_reinforce.engine.llvm.lanes import INFINITY, ROUND, Lanes
 
 #: What no task and no policy of ours computes with: the C library does, in double precision.
-RARE = ("acosh", "asinh", "atanh", "cbrt", "cosh", "erfc", "exp2", "sinh")
+RARE = ("acosh", "asinh", "atanh", "cbrt", "cosh", "erf", "erfc", "exp2", "sinh")
 #: The names of the scalar graph that the C library has as functions of doubles.
 _LIBRARY = (
     *("acos", "acosh", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "cos", "cosh", "erf"),
@@ -55,10 +55,9 @@ def _times_power_of_2(x: Lanes, n: Lanes) -> Lanes:
     return (x.bits() + (n << 23)).bits()
 
 
-def exp(x: Lanes, less: Lanes | None = None) -> Lanes:
-    """Returns the exponential of x, or of x - less, where |less| < 0.05."""
+def exp(x: Lanes) -> Lanes:
+    """Returns the exponential."""
     rest, n = _reduced(x)
-    rest = rest if less is None else rest - less
     result = _times_power_of_2(_exp_less_1(rest) + 1, n)
     result = (x < _LEAST).where(0.0, result)
     return (x <= _GREATEST).where(result, x * INFINITY)  # infinity or NaN
@@ -122,37 +121,6 @@ def log1p(x: Lanes) -> Lanes:
     result = (x < INFINITY).where(_log_of_parts(less_1, exponent), x)
     result = (x > -1.0).where(result, (x < -1.0).where(math.nan, x * INFINITY))
     return result.call("copysign", x)
-
-
-def _erf_near_0(x: Lanes) -> Lanes:
-    """Returns the error function for |x| < 1 / 2. Coefficients: minimax, fitted by us to 1.4e-9."""
-    higher = (x * x).polynomial(
-        *(0.0047179897799228826, -0.026757184144224241, 0.11282822808591147),
-        *(-0.37612608572861744, 0.1283791655673648),
-    )
-    return higher * x + x
-
-
-def _erfc_of_greater(x: Lanes) -> Lanes:
-    """Returns 1 - erf(x) for x > 1 / 2: exp(-x^2) by a rational function, fitted by us to 1e-9."""
-    x = (x > 10.1).where(10.1, x)
-    above = x.polynomial(
-        *(0.043689161344163209, 0.27346242694504136, 0.81809309172995566),
-        *(1.3140095917051087, 1.0000099372629862),
-    )
-    below = x.polynomial(
-        *(0.077436738058146783, 0.48471147468597858, 1.488531496149020),
-        *(2.5737118139924751, 2.4424857004448279, 1),
-    )
-    high = (x.bits() & ~0xFFF).bits()  # its square is exact
-    return exp(-high * high, less=(x - high) * (x + high)) * (above / below)
-
-
-def erf(x: Lanes) -> Lanes:
-    """Returns the error function."""
-    size = abs(x)
-    far = (1 - _erfc_of_greater(size)).call("copysign", x)
-    return (size < 0.5).where(_erf_near_0(x), far)
 
 
 def erf_inv(x: Lanes) -> Lanes:
@@ -432,7 +400,7 @@ def _erf_inv(x: Lanes) -> Lanes:
 #: Those of float32 lanes that are ours.
 _OURS: tuple[Callable[..., Lanes], ...] = (
     *(acos, asin, atan, atan2, cos, sin, tan),
-    *(erf, erf_inv, exp, expm1, log, log1p, logistic, pow, tanh),
+    *(erf_inv, exp, expm1, log, log1p, logistic, pow, tanh),
 )
 #: dtype -> name of the operation -> (operands) -> the result
 FUNCTIONS: dict[str, dict[str, Callable[..., Lanes]]] = {

@@ -30,7 +30,6 @@ only pairs whose bounding spheres meet are collided, as in C.
 """
 
 import types
-from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -56,8 +55,6 @@ _LIES = 0.0888
 _FAR = 1e3
 #: A collision function of MJX: (model, data, key, geoms [P, 2]) -> dist, pos, frame of contacts.
 Collide = Callable[..., Any]
-#: How many bodies ``advice`` names.
-_LISTED = 3
 
 
 @collider(ncon=2)
@@ -298,23 +295,6 @@ def one_by_one(collide: Collide) -> Collide:
 
     together.ncon = collide.ncon  # pyright: ignore
     return together
-
-
-def advice(model: Any) -> str:
-    """Returns how to make contacts of a MuJoCo model fewer; empty where no geoms can meet."""
-    pairs = [pair[:2] for pair in mjx_internals.geom_pairs(model)]
-    if not pairs:
-        return ""
-    bodies = Counter(int(body) for pair in pairs for body in {*model.geom_bodyid[list(pair)]})
-    named = [
-        f"{model.body(body).name or f'number {body}'!r} ({count})"
-        for body, count in bodies.most_common(_LISTED)
-    ]
-    return (
-        f"its geoms can meet in {len(pairs):,} pairs, most of them at the bodies "
-        f"{', '.join(named)}: let fewer collide, such as the feet alone, by "
-        'contype="0" conaffinity="0" of the other geoms'
-    )
 
 
 _OURS = {

@@ -1,11 +1,4 @@
-"""Whether machine code can play here, what its numbers depend on, and whether it takes too long.
-
-The time is found before anything is written. It goes with the number of scalar operations, and
-with the square of the entries of an observation, all of which LLVM holds at once. On two quiet
-cores a training had started after 48 s with Humanoid-v5 (1.9 million operations), 54 s with
-dm_control's humanoid (2.7 million), and after 19 s and 116 s with observations of 500 and 2,000
-entries, of which some 8 s are XLA's.
-"""
+"""Whether machine code can play here, and what its numbers depend on."""
 
 import hashlib
 import platform as host
@@ -14,10 +7,8 @@ from typing import Any
 
 import jax
 
-from mjx_reinforce.engine.base import Environment
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.gpu import seam as gpu
-from mjx_reinforce.engine.scalar import TooLarge, jaxprs, size
 
 #: LLVM 20, which llvmlite 0.45 has, is the first that reads the IR as it is written here.
 _OLDEST = (20,)
@@ -28,9 +19,6 @@ _SETTINGS = (
     *("jax_default_matmul_precision", "jax_default_prng_impl", "jax_threefry_partitionable"),
     *("jax_random_seed_offset", "jax_disable_most_optimizations", "jax_numpy_dtype_promotion"),
 )
-#: Nobody waits longer for what ``jax.vmap`` compiles in less.
-MAX_SECONDS = 80
-_PER_SCALAR, _PER_PAIR_OF_ENTRIES = 2e-5, 2.7e-5
 
 
 def platform() -> str:
@@ -98,31 +86,3 @@ def unavailable() -> str | None:
     if not jax.config.values["jax_threefry_partitionable"]:
         return "it draws noise as JAX does with jax_threefry_partitionable"
     return gpu.kernels_unavailable() if platform() == "gpu" else None
-
-
-def check_seconds(env: Environment, traced: jaxprs.Program, entries: int) -> None:
-    """Raises TooLarge for a step that takes too long to write and compile.
-
-    Args:
-      env: whose step it is.
-      traced: the step.
-      entries: of an observation.
-    """
-    expected = _seconds(traced, entries)
-    if expected > MAX_SECONDS:
-        model = getattr(env, "mj_model", None)
-        wide = _PER_PAIR_OF_ENTRIES * entries**2 > expected / 2
-        cause = f"of an observation of {entries:,} entries" if wide else "of its size"
-        remedy = ""
-        if not wide and model is not None:
-            from mjx_reinforce.engine.physics.contacts import advice  # imports MJX: a second
-
-            remedy = f"; {advice(model)}"
-        raise TooLarge(
-            f"writing it out and compiling it would take about {expected:.0f} s, more than "
-            f"{MAX_SECONDS} s, because {cause}{remedy}"
-        )
-
-
-def _seconds(traced: jaxprs.Program, entries: int) -> float:
-    return _PER_SCALAR * size.num_scalars(traced) + _PER_PAIR_OF_ENTRIES * entries**2

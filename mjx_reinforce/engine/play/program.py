@@ -208,9 +208,7 @@ def load(
     source = f"{use} {jaxprs.fingerprint(traced)} {objects.source_digest(*_WRITERS)}"
 
     def write() -> str:
-        if env is not None:
-            available.check_seconds(env, traced, observation_size(env))
-        written = scalarized.build(traced, shapes, BRANCH_COST, SCANS)
+        written = _written(traced, shapes, 0 if env is None else observation_size(env))
         title = f"; {name}, {lockstep.operations(written.schedule):,} scalar operations\n"
         return title + (writers.cpu(written, target) if target else writers.gpu(written))
 
@@ -218,6 +216,13 @@ def load(
         return machine.load_module(source, write, handler.NAMES, target, objects.folder()), shapes
     capability = gpu_seam.compute_capability()
     return ptx.load_kernel(source, write, capability, objects.folder()), shapes
+
+
+def _written(traced: jaxprs.Program, shapes: Any, entries: int = 0) -> scalarized.Scalarized:
+    written = scalarized.build(traced, shapes, BRANCH_COST, SCANS, entries=entries)
+    if written.captured:
+        raise scalar.UnsupportedPrimitive("it needs an array of an outer transformation")
+    return written
 
 
 def _by_teams(
@@ -236,8 +241,7 @@ def _by_teams(
             source = f"{jaxprs.fingerprint(traced)} {physics} {objects.source_digest(*_WRITERS)}"
 
             def write() -> str:
-                written = scalarized.build(traced, shapes, BRANCH_COST, SCANS)
-                return writers.team(written, physics)
+                return writers.team(_written(traced, shapes), physics)
 
             capability = gpu_seam.compute_capability()
             return ptx.load_kernel(f"{use} {source}", write, capability, objects.folder()), shapes

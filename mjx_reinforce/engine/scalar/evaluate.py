@@ -40,7 +40,7 @@ def run(
     used = [True] * len(jaxpr.outvars) if used is None else used
     values = dict(zip(jaxpr.invars, args, strict=True))
     for variable, const in zip(jaxpr.constvars, program.consts, strict=True):
-        values[variable] = graph.constant(const)
+        values[variable] = jaxprs.as_numpy(const)
 
     def read(atom: Any) -> np.ndarray:
         return jaxprs.literal_value(atom) if jaxprs.is_literal(atom) else values[atom]

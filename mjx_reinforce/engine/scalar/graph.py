@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from mjx_reinforce.engine.scalar import arrays, jaxprs, nodes
+from mjx_reinforce.engine.scalar import jaxprs, nodes
 from mjx_reinforce.engine.scalar.nodes import Node, Op, Scalar, Scope
 from mjx_reinforce.engine.scalar.passes import simplify
 from mjx_reinforce.engine.scalar.size import MAX_SCALARS, TooLarge
@@ -32,7 +32,6 @@ class Graph:
     path: the equations that are being evaluated, from the outermost one, by their ids.
     learned: what was found out on a path. The body of a loop is evaluated again and again, each
       time with less assumed of what never changes, and what was found out inside still holds.
-    captured: the arrays that the program closes over and whose values are not known yet, by id.
     certain: predicates of the branches and loops around the present scope. Its code runs only
       if each of them is true for at least one element of the batch.
     """
@@ -46,7 +45,6 @@ class Graph:
         self.certain: set[Node] = set()
         self._scopes = [Scope(depth=0, floor=0)]
         self._count = self._applied = 0
-        self.captured: dict[int, tuple[nodes.Captured, np.ndarray]] = {}
 
     @property
     def scope(self) -> Scope:
@@ -118,20 +116,6 @@ class Graph:
         """Makes a node that nothing computes: an input, a loop's carry, a gate's result."""
         index = self.number()
         return Node(np.dtype(dtype), varying, self.scope, index, owner=owner, position=position)
-
-    def constant(self, value: Any) -> np.ndarray:
-        """Returns a captured array: its value, or for a tracer one leaf for each element."""
-        known = jaxprs.as_numpy(value)
-        if known is not None:
-            return known
-        if id(value) not in self.captured:
-            source = nodes.Captured(value)
-            leaves = [
-                Node(value.dtype, False, self._scopes[0], self.number(), owner=source, position=i)
-                for i in range(value.size)
-            ]
-            self.captured[id(value)] = (source, arrays.pack(leaves, value.shape, value.dtype))
-        return self.captured[id(value)][1]
 
     def number(self) -> int:
         """Returns the next index."""

@@ -108,10 +108,10 @@ def fingerprint(traced: Program) -> str:
     """Returns a hash of a program and of the constants in it, the same in every process."""
     digest = hashlib.sha256(re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr)).encode())
     for const in [*traced.consts, *_inner_constants(traced.jaxpr)]:
-        value = as_numpy(const)
-        if value is None:
+        if is_traced(const):
             digest.update(b"unknown")
         else:
+            value = as_numpy(const)
             digest.update(f"{value.dtype}{value.shape}".encode() + value.tobytes())
     return digest.hexdigest()
 
@@ -149,8 +149,8 @@ def callee(eqn: Equation) -> Program | None:
     if eqn.primitive.name == "call_hi_primitive":  # JAX 0.12: composite primitives
         avals = [variable.aval for variable in eqn.invars]
         return program(jax.make_jaxpr(eqn.params["_prim"].expand)(*avals))
-    if eqn.primitive.name in _OF_KEYS:  # a key is an array of its words
-        return program(jax.make_jaxpr(_OF_KEYS[eqn.primitive.name](eqn))(*map(words, eqn.invars)))
+    if eqn.primitive.name in _COMPOSED:  # a key is an array of its words
+        return program(jax.make_jaxpr(_COMPOSED[eqn.primitive.name](eqn))(*map(words, eqn.invars)))
     return None
 
 
@@ -186,8 +186,25 @@ def _implementation(key: Atom) -> Any:
     return dtype._impl
 
 
-#: What is done to keys, as functions of their words: equation -> function.
-_OF_KEYS: dict[str, Callable[[Equation], Callable[..., Any]]] = {
+def _largest(eqn: Equation) -> Callable[[jax.Array], list[jax.Array]]:
+    """Returns ``top_k`` as a sort: -NaN, -inf, ..., -0, 0, ..., inf, NaN, equal ones in order."""
+    k, axis = eqn.params["k"], eqn.params["axis"]
+
+    def largest(x: jax.Array) -> list[jax.Array]:
+        order = x
+        if np.issubdtype(x.dtype, np.floating):  # the order of the bits, but of negative numbers
+            bits = lax.bitcast_convert_type(x, f"int{8 * x.dtype.itemsize}")
+            order = lax.select(bits < 0, bits ^ np.iinfo(bits.dtype).max, bits)
+        places = lax.broadcasted_iota(np.int32, x.shape, axis)
+        _, *found = lax.sort((~order, x, places), dimension=axis)
+        return [lax.slice_in_dim(y, 0, k, axis=axis) for y in found]
+
+    return largest
+
+
+#: What other operations make up, and what is done to keys, as functions of their words:
+#: equation -> function.
+_COMPOSED: dict[str, Callable[[Equation], Callable[..., Any]]] = {
     "random_bits": lambda eqn: (
         lambda key: _implementation(eqn.invars[0]).random_bits(
             key, eqn.params["bit_width"], eqn.params["shape"]
@@ -197,6 +214,7 @@ _OF_KEYS: dict[str, Callable[[Equation], Callable[..., Any]]] = {
         lambda key: _implementation(eqn.invars[0]).split(key, eqn.params["shape"])
     ),
     "random_fold_in": lambda eqn: _implementation(eqn.invars[0]).fold_in,
+    "top_k": _largest,
 }
 
 
@@ -248,11 +266,14 @@ def literal_value(atom: Any) -> np.ndarray:
     return np.asarray(atom.val, atom.aval.dtype)
 
 
-def as_numpy(value: object) -> np.ndarray | None:
-    """Returns a constant's value, or None for a tracer, which has none yet."""
-    if isinstance(value, jax.core.Tracer):
-        return None
-    if is_key(jax.typeof(value)):
+def is_traced(value: object) -> bool:
+    """Returns whether a constant has no value yet."""
+    return isinstance(value, jax.core.Tracer)
+
+
+def as_numpy(value: object) -> np.ndarray:
+    """Returns a constant's value."""
+    if not isinstance(value, np.ndarray) and is_key(jax.typeof(value)):
         raise no_keys()
     return np.asarray(value)
 

@@ -123,15 +123,6 @@ class Scope:
     has_loop: bool = False
 
 
-class Captured(NamedTuple):
-    """An array that the program closes over and whose value is not known yet.
-
-    array: a tracer of an outer transformation.
-    """
-
-    array: Any
-
-
 @dataclasses.dataclass(eq=False, slots=True)
 class Node:
     """One value.
@@ -152,7 +143,7 @@ class Node:
     index: int
     op: Op | None = None
     args: tuple[Scalar, ...] = ()
-    owner: "Loop | Gate | Call | Captured | None" = None
+    owner: "Loop | Gate | Call | None" = None
     position: Any = None
 
 

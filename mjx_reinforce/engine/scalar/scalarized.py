@@ -27,6 +27,8 @@ class Scalarized:
     out_avals: shape and dtype of each leaf of the result.
     outputs: the scalars of each leaf of the result.
     schedule: the steps that compute them.
+    captured: arrays that it closes over and that an outer transformation traces; they are further
+      inputs, behind those of its arguments.
     """
 
     in_avals: list[Any]
@@ -34,6 +36,7 @@ class Scalarized:
     out_avals: list[Any]
     outputs: list[list[Scalar]]
     schedule: liveness.Schedule
+    captured: list[jax.Array]
 
     def compile(self, backend: Backend) -> Any:
         """Returns what a backend makes of the function."""
@@ -75,6 +78,7 @@ def build(
     branch_cost: int,
     scans: int = 4,
     varying: Sequence[bool] | None = None,
+    entries: int = 0,
 ) -> Scalarized:
     """Writes a function out.
 
@@ -84,6 +88,7 @@ def build(
       branch_cost: as in ``scalarize``.
       scans: up to which length scans are written out.
       varying: which of its arguments differ from lane to lane; all do if nothing is said.
+      entries: of an observation.
 
     Raises:
       TooLarge: it is more than is written out.
@@ -91,23 +96,26 @@ def build(
     """
     if any(is_key(variable.aval) for variable in program.jaxpr.invars):
         raise jaxprs.no_keys()
-    size.check_size(program)
+    size.check_size(program, entries)
     graph = Graph(branch_cost, scans)
     varying = [True] * len(program.jaxpr.invars) if varying is None else varying
-    inputs = [
-        _input_array(graph, number, variable.aval, varies)
-        for number, (variable, varies) in enumerate(zip(program.jaxpr.invars, varying, strict=True))
-    ]
+    given = [variable.aval for variable in program.jaxpr.invars]
+    captured = [*filter(jaxprs.is_traced, program.consts)]
+    facts = [*zip(given, varying, strict=True), *((jax.typeof(x), False) for x in captured)]
+    inputs = [_input_array(graph, k, *each) for k, each in enumerate(facts)]
+    read = dict(zip(map(id, captured), inputs[len(given) :], strict=True))
+    program = program._replace(consts=[read.get(id(x), x) for x in program.consts])
     with np.errstate(all="ignore"):
-        results = evaluate.run(graph, program, inputs)
+        results = evaluate.run(graph, program, inputs[: len(given)])
     outputs = [arrays.elements(result) for result in results]
     out_avals, out_tree = jax.tree.flatten(out_shape)
     return Scalarized(
-        in_avals=[variable.aval for variable in program.jaxpr.invars],
+        in_avals=given,
         out_tree=out_tree,
         out_avals=out_avals,
         outputs=outputs,
         schedule=liveness.schedule(graph.scope, (x for leaf in outputs for x in leaf)),
+        captured=captured,
     )
 
 

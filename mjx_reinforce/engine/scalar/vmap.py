@@ -17,7 +17,7 @@ from mjx_reinforce.engine.base import PyTree
 from mjx_reinforce.engine.scalar import scalarized
 from mjx_reinforce.engine.scalar.backend import Backend
 from mjx_reinforce.engine.scalar.jaxprs import operation
-from mjx_reinforce.engine.scalar.nodes import Captured, Node, Op, Scalar, is_constant
+from mjx_reinforce.engine.scalar.nodes import Node, Op, Scalar, is_constant
 from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop
 from mjx_reinforce.engine.scalar.primitives import any_lane
 
@@ -88,6 +88,7 @@ def evaluate(written: scalarized.Scalarized, leaves: Sequence[Any], varying: Seq
         jnp.moveaxis(x, 0, -1).reshape(-1, batch) if varies else jnp.reshape(x, -1)
         for x, varies in zip(leaves, varying, strict=True)
     ]
+    rows += [x.reshape(-1) for x in written.captured]
 
     def read(place: tuple[int, int]) -> jax.Array:
         return lax.index_in_dim(rows[place[0]], place[1], keepdims=False)
@@ -122,12 +123,7 @@ class XLA(Backend[Any]):
         return number
 
     def leaf(self, node: Node) -> Any:
-        """Reads an input, or an element of a captured array in row-major order."""
-        if isinstance(node.owner, Captured):
-            array = node.owner.array
-            return lax.index_in_dim(
-                lax.reshape(array, (array.size,)), node.position, keepdims=False
-            )
+        """Reads an input."""
         return self._read(node.position)
 
     def node(self, node: Node, operands: list[Any]) -> Any:

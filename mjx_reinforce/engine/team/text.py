@@ -140,8 +140,7 @@ class CText(Backend[str]):
     def leaf(self, node: Node) -> str:
         """An input is read where it is used."""
         place = self._place(node)
-        if place is None:
-            raise UnsupportedPrimitive("it needs an array of an outer transformation")
+        assert place is not None
         return f"{place.array}[{place.entry}]"
 
     def value(self, scalar: Scalar, values: dict[Node, str]) -> str:

@@ -5,18 +5,18 @@ import re
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from players import actor_and_act, assert_same_episodes, both, only_active, played
-from scenes import SCENE
 from toys import Drifting
 
 from mjx_reinforce import Box
+from mjx_reinforce.engine import scalar
 from mjx_reinforce.engine.base import Discrete
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.play import available, choice, native, objects, program, rollouts
+from mjx_reinforce.engine.scalar import scalarized, size
 from mjx_reinforce.registry import DISTRIBUTIONS, load_definition
 
 if reason := available.unavailable():
@@ -234,16 +234,17 @@ def test_auto_falls_back_whatever_the_writer_raises(monkeypatch):
 
 @pytest.mark.cpu
 def test_large_models_are_not_for_machine_code(monkeypatch):
-    """The reason says which bodies meet most."""
-    env = Drifting()
-    env.mj_model = mujoco.MjModel.from_xml_string(SCENE)  # pyright: ignore
     monkeypatch.setattr(objects, "folder", lambda: None)
     monkeypatch.setattr(machine, "_LOADED", {})
-    monkeypatch.setattr(available, "MAX_SECONDS", 1e-9)
-    engine = chosen(env)
+    monkeypatch.setattr(size, "MAX_SCALARS", 9)
+    engine = chosen(Drifting())
     assert engine.name == "vmap"
-    assert "more than 1e-09 s, because of its size; its geoms can meet in" in engine.why
-    assert re.search(r"bodies 'world' \(\d+\), .* the feet alone, by contype", engine.why)
+    assert re.search("about .* scalar operations, more than 9; let fewer geoms", engine.why)
+
+
+def test_long_observations_are_not_for_machine_code():
+    with pytest.raises(scalar.TooLarge, match="observe less"):
+        size.check_size(scalarized.trace(jnp.sin, 1.0)[0], 1_800)
 
 
 # -------------------------------------------------------------------------------------------------

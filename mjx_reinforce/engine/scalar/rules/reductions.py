@@ -12,7 +12,6 @@ from mjx_reinforce.engine.scalar import arrays, jaxprs
 from mjx_reinforce.engine.scalar.arrays import Array, Results
 from mjx_reinforce.engine.scalar.graph import Graph
 from mjx_reinforce.engine.scalar.jaxprs import Equation
-from mjx_reinforce.engine.scalar.nodes import Op
 
 
 def _reduce(graph: Graph, eqn: Equation, x: Array, *, combine: str, empty: float) -> list:
@@ -87,56 +86,6 @@ def _precedes(graph: Graph, x: Any, y: Any) -> Any:
     """Returns whether x < y, where NaN is above everything."""
     number, nan = graph.call("eq", x, x), graph.call("ne", y, y)
     return graph.call("or", graph.call("lt", x, y), graph.call("and", number, nan))
-
-
-def _top_k(graph: Graph, eqn: Equation, x: Array) -> Results:
-    """The k largest elements, the first of equal ones first, and where they are.
-
-    The list of the k largest so far is in order, and each element in turn is put into it, behind
-    those that are no smaller.
-    """
-    k, axis = eqn.params["k"], eqn.params["axis"]
-    rows = np.moveaxis(arrays.lift(x), axis, -1)
-    found = [_largest(graph, list(row), k) for row in rows.reshape(-1, x.shape[axis])]
-    results = []
-    for part, out in zip(zip(*found, strict=True), eqn.outvars, strict=True):
-        scalars = [scalar for row in part for scalar in row]
-        packed = arrays.pack(scalars, (*rows.shape[:-1], k), out.aval.dtype)
-        results.append(np.moveaxis(packed, -1, axis))
-    return results
-
-
-def _largest(graph: Graph, row: list, k: int) -> tuple[list, list]:
-    """Returns the k largest scalars, and their positions."""
-    best: list[tuple] = []  # (order, value, position)
-    for i, value in enumerate(row):
-        order = _ordered(graph, value)
-        moving = order, value, np.int32(i)
-        for rank, other in enumerate(best):
-            wins = graph.call("gt", order, other[0])
-            choose = functools.partial(graph.select, wins)
-            best[rank], moving = (
-                tuple(map(choose, moving, other)),
-                tuple(map(choose, other, moving)),
-            )
-        if len(best) < k:
-            best.append(moving)
-    return [value for _, value, _ in best], [position for *_, position in best]
-
-
-def _ordered(graph: Graph, value: Any) -> Any:
-    """Returns an integer that is greater where XLA's total order puts a number higher.
-
-    That is -NaN, -inf, ..., -0, 0, ..., inf, NaN: the order of the bits, but for negative numbers.
-    """
-    if value.dtype.kind in "biu":
-        return value
-    integer = np.dtype(f"int{8 * value.dtype.itemsize}")
-    op = Op("bitcast_convert_type", (("new_dtype", integer),))
-    bits = graph.apply(op, (value,), integer)
-    negative = graph.call("lt", bits, integer.type(0))
-    flipped = graph.call("xor", bits, integer.type(np.iinfo(integer).max))
-    return graph.select(negative, flipped, bits)
 
 
 def _reducer(combine: str, empty: float) -> Callable:
@@ -253,7 +202,6 @@ RULES = {
     "argmax": functools.partial(_arg_extreme, better="gt"),
     "argmin": functools.partial(_arg_extreme, better="lt"),
     "sort": _sort,
-    "top_k": _top_k,
     "dot_general": _dot_general,
     "cholesky": _cholesky,
     "triangular_solve": _triangular_solve,
