@@ -144,10 +144,10 @@ def reinforce(
 
     One update plays N complete episodes and follows the gradient of
 
-        (1/N) sum_n sum_t (weight[t, n] log pi(a[t, n] | o[t, n]) + entropy_cost H[t, n])
+        (1/N) sum_n sum_t (w[t, n] log pi(a[t, n] | o[t, n]) + entropy_cost H[t, n])
 
-    with the weights that the estimator gives. An episode in which the simulation left the finite
-    numbers counts as the worst of the others; where all did, nothing is learned.
+    with the weights w that the estimator gives. An episode with numbers that are not finite counts
+    as the worst of the others; if all episodes have such numbers, nothing is learned.
 
     Numbers such as ``entropy_cost``, the estimator's discount and the optimizer's learning rate
     may be traced: build the learner inside a function to vmap over them.
@@ -336,13 +336,12 @@ def train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics
 
     Returns:
       The next state, and metrics, each []: ``episodes`` (N), ``episode_return`` (mean over the N
-      episodes; with ``_min`` and ``_max``), ``episode_length``, ``env_steps``
-      (played in this update), ``simulated_steps`` (with those in which an episode was over
-      already; of the native engine they depend on which thread is first),
-      ``nonfinite_episodes`` (those that broke, which count above with what they earned until
-      then), and ``skipped_update`` (1 where the proposed state was not finite, as where all
-      episodes broke, and the old one was kept). Then the
-      diagnostics, NaN where an episode was not finite or the update was skipped:
+      episodes; with ``_min`` and ``_max``), ``episode_length``, ``env_steps`` (played in this
+      update), ``simulated_steps`` (also those after an episode's end; with the native engine they
+      depend on which thread is first), ``nonfinite_episodes`` (those that broke; they count above
+      with what they earned until then), and ``skipped_update`` (1 if the proposed state was not
+      finite, so that the old one was kept). Then the
+      diagnostics, NaN if an episode was not finite or the update was skipped:
       ``entropy``, ``kl``, ``policy_std`` (see ``diagnostics.policy_metrics``),
       ``gradient_norm``, ``gradient_snr`` (of ``full_batch``, ``natural_gradient`` and ``ars``
       alone), ``clipped_gradients`` (see ``updates``),

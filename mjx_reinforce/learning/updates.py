@@ -71,7 +71,7 @@ def full_batch() -> Update:
 
     Of two episodes or more, its metrics have ``gradient_snr``, the signal-to-noise ratio over
     episodes of that gradient, see ``signal_to_noise``. The noise is estimated from one
-    episode in 32, at least from one and at most from 64: from few it is right on average alone.
+    episode in 32, at least from one and at most from 64. From few, it is right only on average.
 
     Examples:
       >>> import jax

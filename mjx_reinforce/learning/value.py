@@ -59,10 +59,10 @@ def value_baseline(
     """Weights an action by G[t] - V(o[t], t), V learned (Sutton and Barto 2018, section 13.4).
 
     V reads the time besides the observation, for what is still earned depends on the steps that
-    are left (Pardo et al. 2018, arXiv:1712.00378). Each update goes on from the network and the
-    optimizer's state that the last one left, and fits them to G in units of its running standard
-    deviation, from its running mean, so that a learning rate means the same in every task. (Before
-    the first update V is 0.)
+    are left (Pardo et al. 2018, arXiv:1712.00378). Each update continues with the network and the
+    optimizer's state of the last one. V is fitted to G less its running mean, over its running
+    standard deviation, so that a learning rate means the same in every task. (Before the first
+    update V is 0.)
 
     Args:
       discount: in [0, 1].

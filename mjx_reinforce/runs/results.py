@@ -208,8 +208,8 @@ def sweep(
       base: the settings that are not swept, such as ``mjx_reinforce.of_task("Hopper-v5")``.
       over: names of settings and the values of each; all combinations are trained.
       output: the directory of the sweep's files. None, with ``base.output`` None too, leaves none.
-      exact: move every run by itself, so that no result depends in any bit on the others.
-      chunk_runs: runs that are under way at once at most; as many as memory holds by default.
+      exact: train one run at a time, so that no bit of a result depends on the other runs.
+      chunk_runs: most runs that train at the same time; by default as many as fit in memory.
       report: write report.html among the files.
       quiet: show no progress.
 

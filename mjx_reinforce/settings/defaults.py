@@ -32,8 +32,8 @@ def of_task(
 ) -> Config:
     """Returns the default settings for an environment, also for one that the table lacks.
 
-    What is made for a smaller budget is stretched: schedules that would end before the run are as
-    long as it, and where episodes are long there are no more than some fifty evaluations.
+    Settings for a smaller budget are stretched: a schedule that would end before the run is as long
+    as the run, and with long episodes there are at most some fifty evaluations.
 
     Args:
       env: its id.

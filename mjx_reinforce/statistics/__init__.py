@@ -87,10 +87,10 @@ def iqm_interval(
       confidence: the interval's level.
 
     Returns:
-      Its lower and upper ends. Both are NaN of fewer than six seeds (see ``enough``) and of fewer
-      than eleven that are all alike: as many as that are, one time in twenty, also where a quarter
-      of all seeds differs. An end is NaN too where so many seeds failed that there is no mean in
-      the resamples around it.
+      Its lower and upper ends. Both are NaN for fewer than six seeds (see ``enough``), and for
+      fewer than eleven seeds that are all alike: that happens one time in twenty even if a quarter
+      of all seeds differs. An end is also NaN if so many seeds failed that the resamples around it
+      have no mean.
 
     Examples:
       >>> import numpy as np

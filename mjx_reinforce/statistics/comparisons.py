@@ -126,8 +126,8 @@ def paired_difference(x: ArrayLike, y: ArrayLike, confidence: float = 0.95) -> D
       confidence: the interval's level.
 
     Returns:
-      Arrays [...]. The interval is NaN where all differences are equal, for they do not show how
-      far others would be from them, and of fewer than six seeds.
+      Arrays [...]. The interval is NaN for fewer than six seeds, and where all differences are
+      equal, because they do not show how far others would lie from them.
 
     Raises:
       ValueError: x and y differ in number.
