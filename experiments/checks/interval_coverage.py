@@ -13,7 +13,7 @@ import numpy as np
 from scipy import stats
 
 from experiments.studies.seeds import answers
-from mjx_reinforce.statistics import aggregates, comparisons, survival
+from mjx_reinforce.statistics import aggregates, comparisons, iqm_interval, mean_interval, survival
 
 SEEDS = (6, 20, 50, 200)
 
@@ -36,25 +36,25 @@ DISTRIBUTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "two peaks": two_peaks,
     "heavy tail (Student's t, 3)": stats.t(3).ppf,
 }
-STATISTICS = ("mean", "iqm", "cvar")
+#: Intervals, and the part of the ordered seeds that each is of the mean of.
+INTERVALS = {"mean": (mean_interval, 0, 1), "iqm": (iqm_interval, 0.25, 0.75)}
 
 
-def truth(quantile: Callable[[np.ndarray], np.ndarray], statistic: str) -> float:
-    """Returns a statistic of the distribution itself, from a million of its quantiles."""
+def truth(quantile: Callable[[np.ndarray], np.ndarray], low: float, high: float) -> float:
+    """Returns the mean of a part of the distribution itself, from a million of its quantiles."""
     values = quantile((np.arange(10**6) + 0.5) / 10**6)
-    low, high = {"mean": (0, 1), "iqm": (0.25, 0.75), "cvar": (0, 0.1)}[statistic]
     return float(np.mean(values[int(low * 10**6) : int(high * 10**6)]))
 
 
 def one_sample(draws: int) -> Iterator[tuple[str, str, list[str]]]:
     """Yields interval, distribution and coverage by seeds for statistics of one configuration."""
-    for statistic in STATISTICS:
+    for statistic, (interval, low, high) in INTERVALS.items():
         for name, quantile in DISTRIBUTIONS.items():
-            true = truth(quantile, statistic)
+            true = truth(quantile, low, high)
             cells = []
             for num_seeds in SEEDS:
                 values = quantile(np.random.default_rng(num_seeds).random((draws, num_seeds)))
-                cells.append(share(*aggregates.interval(statistic, values)[1:], true))
+                cells.append(share(*interval(values), true=true))
             yield statistic, name, cells
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from mjx_reinforce.reports.experiment import Configuration, Experiment
 from mjx_reinforce.statistics import Estimate, iqm, iqm_interval
-from mjx_reinforce.statistics.aggregates import interval, wilson
+from mjx_reinforce.statistics.aggregates import cvar, estimate_mean, wilson
 from mjx_reinforce.statistics.comparisons import (
     Comparison,
     compare_all,
@@ -78,7 +78,7 @@ class Result(NamedTuple):
     final: np.ndarray
     scores: np.ndarray
     mean: Estimate
-    tail: Estimate
+    tail: float
     iqm: Estimate
     band: Estimate
     seeds: np.ndarray
@@ -206,12 +206,12 @@ def _result(
         configuration=part,
         final=final,
         scores=scores,
-        mean=interval("mean", scores),
-        tail=interval("cvar", scores),
+        mean=estimate_mean(scores),
+        tail=float(cvar(scores)),
         iqm=Estimate(iqm(final), *iqm_interval(final)),
         band=band,
         seeds=seeds,
-        area=interval("mean", areas),
+        area=estimate_mean(areas),
         solving=solving,
     )
 

@@ -43,7 +43,7 @@ def _results_table(findings: Findings) -> Listing:
     rows = []
     for each in findings.results:
         seeds = len(each.final)
-        cells = [(f"{seeds:,}", ""), *map(_cell, (each.mean, each.iqm, each.tail))]
+        cells = [(f"{seeds:,}", ""), _cell(each.mean), _cell(each.iqm), (number(each.tail), "")]
         if (solving := each.solving) is not None:
             share = f"{solving.at_end:,} of {seeds:,}"
             cells.append((share, interval_in_words(solving.rate, percent)))

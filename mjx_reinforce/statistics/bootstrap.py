@@ -64,8 +64,10 @@ def resampled_trim_means(values: np.ndarray, cut: float = 0.0) -> np.ndarray:
     counts = _draws_between(num_seeds, trimmed, num_seeds - trimmed)
     used = counts.any(axis=1)
     ordered = np.sort(values, axis=1)
-    middle, above = from_the_middle(ordered)
-    above = above[:, used]
+    # Sums of how far values are above the middle one have no rounding where all equal it.
+    middle = ordered[:, [num_seeds // 2]]
+    middle = np.where(np.isneginf(middle), 0.0, middle)
+    above = np.where(np.isneginf(ordered), 0.0, ordered - middle)[:, used]
     means = np.empty((len(values), RESAMPLES))
     for some in _parts():
         means[:, some] = above @ counts[used, some].astype(float)
@@ -74,17 +76,6 @@ def resampled_trim_means(values: np.ndarray, cut: float = 0.0) -> np.ndarray:
     lowest = np.argmax(counts > 0, axis=0)
     means[lowest < np.sum(np.isneginf(ordered), axis=1, keepdims=True)] = -np.inf
     return means
-
-
-def from_the_middle(ordered: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the middle one of sorted values [P, 1], and how far above it they all are [P, S].
-
-    Sums of these have no rounding where all that is summed equals the one in the middle. A value
-    of -inf counts as 0 above.
-    """
-    middle = ordered[:, [ordered.shape[1] // 2]]
-    middle = np.where(np.isneginf(middle), 0.0, middle)
-    return middle, np.where(np.isneginf(ordered), 0.0, ordered - middle)
 
 
 def expanded_tail(confidence: float, freedom: int, shrinkage: float = 1.0) -> float:

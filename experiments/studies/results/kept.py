@@ -21,7 +21,7 @@ from experiments.studies.results.tasks import Task
 from mjx_reinforce.files import csv_text, read_json, write_bytes, write_json
 from mjx_reinforce.reports.sources import PROVENANCE, read_columns, read_metrics
 from mjx_reinforce.statistics import steps_to_solve
-from mjx_reinforce.statistics.aggregates import interval
+from mjx_reinforce.statistics.aggregates import estimate_mean
 
 #: The policies that are played, by rank in the final evaluation.
 POLICIES = ("best", "median")
@@ -176,7 +176,7 @@ def _curve_rows(
             at = np.concatenate(
                 [x[np.searchsorted(times, second * (1 + 1e-9), "right") - 1] for times, x in runs]
             )
-            numbers = (second, *interval("mean", at))
+            numbers = (second, *estimate_mean(at))
             yield {"task": task, "device": device} | dict(zip(_CURVE, numbers, strict=True))
 
 

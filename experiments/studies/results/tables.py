@@ -12,8 +12,8 @@ from experiments.kit.markdown import fixed, percent, table
 from experiments.studies.results import kept
 from experiments.studies.results.kept import POLICIES, Columns, Group, Result
 from experiments.studies.results.tasks import PUBLISHED_SEEDS
-from mjx_reinforce.statistics import Estimate, finite_or_nan
-from mjx_reinforce.statistics.aggregates import interval
+from mjx_reinforce.statistics import Estimate, finite_or_nan, iqm, iqm_interval
+from mjx_reinforce.statistics.aggregates import estimate_mean
 
 #: Env steps within which the pendulum should be solved.
 WITHIN = (50_000, 100_000)
@@ -83,11 +83,12 @@ def _result_row(result: Result) -> list[str]:
         result.task.name,
         f"{len(tested):,}",
         f"{facts['settings']['env_steps']:,}",
-        *(estimate(interval(of, tested)) for of in ("iqm", "mean")),
+        estimate(Estimate(iqm(tested), *iqm_interval(tested))),
+        estimate(estimate_mean(tested)),
         "failed" if np.isnan(tested).any() else number(tested.min()),
         solved,
         "none" if published is None else estimate(published_interval(*published)),
-        verdict(interval("mean", tested), published),
+        verdict(estimate_mean(tested), published),
         f"{seconds(facts['run_seconds'])}, {seconds(facts['compile_seconds'])}",
         f"{facts['cpu_count']} CPU cores" if facts["device"] == "cpu" else machine,
     ]
@@ -124,7 +125,7 @@ def gpu(groups: Sequence[Group], docs: Path) -> str:
             group.device.removeprefix("NVIDIA ").split()[0],
             str(len(group.final)),
             f"{number(group.minute.mean())}, {number(group.minute.min())}",
-            estimate(interval("mean", group.final)),
+            estimate(estimate_mean(group.final)),
             *map(number, (group.final.min(), group.final.max())),
             seconds(group.seconds) + _stopped(group),
             f"{group.env_steps:.2g}".replace("e+0", "e").replace("e+", "e"),
@@ -190,7 +191,7 @@ def compare(ours: ArrayLike, theirs: ArrayLike) -> tuple[Estimate, Estimate, Est
     if ours.std() > 0 or theirs.std() > 0:
         welch = stats.ttest_ind(theirs, ours, equal_var=False).confidence_interval(0.95)
         low, high = float(welch.low), float(welch.high)
-    return interval("mean", ours), interval("mean", theirs), Estimate(difference, low, high)
+    return estimate_mean(ours), estimate_mean(theirs), Estimate(difference, low, high)
 
 
 def play(played: Mapping[str, Columns], docs: Path) -> str:
