@@ -1,13 +1,22 @@
 """``python -m mjx_reinforce.envs`` lists the environments, or describes one."""
 
 import dataclasses
+import inspect
 import sys
+from typing import TYPE_CHECKING
 
+import numpy as np
 import tyro
 
 from mjx_reinforce import envs
+from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.streams import say
+from mjx_reinforce.settings.defaults import of_task
 from mjx_reinforce.settings.flags import run_command
+
+if TYPE_CHECKING:
+    from mjx_reinforce.engine.base import Environment
+    from mjx_reinforce.envs.base import MujocoEnv
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,10 +39,75 @@ def _print(settings: EnvsSettings) -> None:
         return
     envs.check_id(settings.env)
     from mjx_reinforce.console.jax_setup import configure_jax
-    from mjx_reinforce.runs.about_task import about_task
 
     configure_jax()
     say(about_task(settings.env), sys.stdout)
+
+
+def about_task(id: str) -> str:
+    """Returns a page about a task, of paragraphs and lists.
+
+    Args:
+      id: of ours, or module:Class.
+
+    Raises:
+      ValueError: there is none, or it cannot be built.
+    """
+    env, config = envs.make(id), of_task(id)
+    doc = inspect.cleandoc(type(env).__doc__ or "").replace("``", "`")
+    said = (" ".join(paragraph.split()) for paragraph in doc.split("\n\n") if paragraph)
+    train = f"{command('train')} --env {id}"
+    how = f"""To train {config.num_seeds} seeds for {config.env_steps:,} env steps each:
+
+  {train}
+
+--minutes M sets a time in place of a number of env steps; --help shows its default settings."""
+    return "\n\n".join([id, _sizes(env), *said, *_settings(env), how])
+
+
+def _sizes(env: "MujocoEnv") -> str:
+    """Returns the sizes of a task, a line each."""
+    from mjx_reinforce.engine.base import observation_size
+
+    limit = getattr(env, "max_episode_steps", None)
+    threshold = getattr(env, "reward_threshold", None)
+    seconds = f", of {env.dt:g} s each" if hasattr(env, "dt") else ""
+    facts = {
+        "observation": f"{observation_size(env)} numbers",
+        "action": _action_in_words(env),
+        "episode": f"at most {limit:,} env steps{seconds}" if limit else "give --horizon a number",
+        "solved": "the task names no return"
+        if threshold is None
+        else f"at a return of {threshold:,g}",
+    }
+    return "\n".join(f"  {name:11}  {fact}" for name, fact in facts.items())
+
+
+def _settings(env: "Environment") -> list[str]:
+    """Returns the settings of a task and their values, one a line, if it has any."""
+    settings = getattr(env, "settings", None)
+    if not dataclasses.is_dataclass(settings):
+        return []
+    fields = dataclasses.fields(settings)
+    lines = [f"  {f.name}={_as_text(getattr(settings, f.name))}" for f in fields if f.init]
+    return ["\n".join(["Its settings, which --env-set NAME=VALUE changes:", *lines])]
+
+
+def _as_text(value: object) -> str:
+    """Returns the value of a setting as ``--env-set`` reads it."""
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+def _action_in_words(env: "Environment") -> str:
+    from mjx_reinforce.engine.base import Discrete, action_space
+
+    space = action_space(env)
+    if isinstance(space, Discrete):
+        return f"one of {space.num_actions}"
+    bounds = np.unique(np.stack([space.low, space.high], axis=1), axis=0)
+    ranges = " or ".join(f"[{low:g}, {high:g}]" for low, high in bounds)
+    count = len(space.low)
+    return f"{count} number{'s' * (count > 1)} in {ranges}"
 
 
 if __name__ == "__main__":

@@ -10,15 +10,14 @@ def main() -> None:
     Flags alone, or a preset, train.
     """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    import importlib
-
     from mjx_reinforce.console.commands import COMMANDS
+    from mjx_reinforce.registry import load_definition
 
     name, sys.argv[1:] = _command(sys.argv[1:])
-    module = importlib.import_module(COMMANDS[name][0])
+    do = load_definition(COMMANDS[name][0])
     signal.signal(signal.SIGINT, signal.default_int_handler)  # each command ends in its own way
     try:
-        module.main()
+        do()
     except KeyboardInterrupt:
         sys.exit(130)
 
@@ -41,8 +40,8 @@ def _command(arguments: list[str]) -> tuple[str, list[str]]:
     if first in ("-V", "--version", "version"):
         print(SCRIPT, ours)
         sys.exit(0)
+    from mjx_reinforce.settings.defaults import PRESETS
     from mjx_reinforce.settings.flags import about_word
-    from mjx_reinforce.settings.tables import PRESETS
 
     if first.startswith("-") or first in PRESETS:
         return "train", arguments

@@ -14,7 +14,7 @@ import gymnasium
 from gymnasium.vector import AutoresetMode
 
 from mjx_reinforce import envs
-from mjx_reinforce.settings.tables import TASKS
+from mjx_reinforce.settings.defaults import HORIZONS
 
 if TYPE_CHECKING:
     from mjx_reinforce.engine.base import Environment
@@ -25,7 +25,7 @@ for _id in envs.names():
         f"mjx_reinforce/{_id}",
         entry_point="mjx_reinforce.gym:only_many",
         vector_entry_point="mjx_reinforce.gym:make",
-        max_episode_steps=TASKS[_id].horizon if _id in TASKS else None,
+        max_episode_steps=HORIZONS.get(_id),
         kwargs={"env": _id},
     )
 

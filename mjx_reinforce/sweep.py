@@ -9,6 +9,6 @@ import signal
 if __name__ == "__main__":  # Ctrl-C ends the imports below without a traceback
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
-    from mjx_reinforce.runs.sweep_command import main
+    from mjx_reinforce.runs.command_line import sweep
 
-    main()
+    sweep()

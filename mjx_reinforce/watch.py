@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mjx_reinforce.engine.base import Environment
     from mjx_reinforce.export.player import Player
 
-#: Where runs are put that name no other place, see ``runs.directory.choose_directory``.
+#: Where runs are put that name no other place, see ``Design.directory``.
 RUNS = Path("runs")
 #: Settings that are whole numbers, with the least and the greatest that is accepted.
 _RANGES = {"width": (1, 4096), "height": (1, 4096), "episode": (0, 2**31 - 1)}

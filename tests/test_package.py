@@ -173,7 +173,7 @@ def test_the_engine_stands_by_itself():
     assert (instant, others, ours) == ("False", "[]", "[]")
 
 
-@pytest.mark.parametrize("command", ["train", "runs.sweep_command", "export.__main__", "new"])
+@pytest.mark.parametrize("command", ["train", "runs.command_line", "export.__main__", "new"])
 def test_what_reads_a_command_line_is_light(command):
     """So that --help, and what is refused, take no second."""
     loaded = run(f"import sys, mjx_reinforce.{command}\nprint('jax' in sys.modules)")
@@ -184,8 +184,8 @@ def test_pages_films_and_logs_wait():
     """What draws and logs is imported when something is drawn or logged."""
     late = ("vl_convert", "jinja2", "tensorboardX", "PIL")
     loaded = run(
-        "import sys, mjx_reinforce.train, mjx_reinforce.watch, mjx_reinforce.runs.sweep_command\n"
-        "import mjx_reinforce.runs.results, mjx_reinforce.runs.run_files\n"
+        "import sys, mjx_reinforce.train, mjx_reinforce.watch, mjx_reinforce.runs.command_line\n"
+        "import mjx_reinforce.runs.results, mjx_reinforce.runs.saving\n"
         "import mjx_reinforce.store.ready\n"
         f"print([m for m in {late} if m in sys.modules])"
     )

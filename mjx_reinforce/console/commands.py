@@ -5,18 +5,21 @@ import sys
 from pathlib import Path
 
 SCRIPT = "mjx-reinforce"
-#: Command -> (the module whose ``main`` it is, what it does).
+#: Command -> (the function that does it, what that is).
 COMMANDS = {
-    "train": ("mjx_reinforce.train", "train policies, many seeds at once"),
-    "watch": ("mjx_reinforce.watch", "make a video of a trained policy, or of the newest run"),
+    "train": ("mjx_reinforce.train:main", "train policies, many seeds at once"),
+    "watch": (
+        "mjx_reinforce.watch:main",
+        "make a video of a trained policy, or of the newest run",
+    ),
     "sweep": (
-        "mjx_reinforce.runs.sweep_command",
+        "mjx_reinforce.runs.command_line:sweep",
         "train many configurations at once, and compare them",
     ),
-    "report": ("mjx_reinforce.report", "make a page with figures of runs and sweeps"),
-    "export": ("mjx_reinforce.export.__main__", "write a policy for NumPy alone"),
-    "new": ("mjx_reinforce.new", "write the class of a task for a MuJoCo model"),
-    "envs": ("mjx_reinforce.envs.__main__", "list the tasks, or describe one"),
+    "report": ("mjx_reinforce.report:main", "make a page with figures of runs and sweeps"),
+    "export": ("mjx_reinforce.export.__main__:main", "write a policy for NumPy alone"),
+    "new": ("mjx_reinforce.new:main", "write the class of a task for a MuJoCo model"),
+    "envs": ("mjx_reinforce.envs.__main__:main", "list the tasks, or describe one"),
 }
 
 

@@ -49,6 +49,10 @@ class Interrupt:
         """Returns whether a signal asks the run to stop."""
         return self.number is not None
 
+    def deferred(self) -> bool:
+        """Returns whether ``defer`` was called."""
+        return self._say is not None
+
     def on_exit(self, action: Callable[[], Any]) -> None:
         """Adds what is done before a signal ends the process, however long that takes.
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from mjx_reinforce.reports.experiment import counted, ordered, say, setting_in_words
 from mjx_reinforce.reports.findings import COMPARED, Findings, by_speed
-from mjx_reinforce.settings.tables import OF_TASKS
+from mjx_reinforce.settings.defaults import OF_TASKS
 from mjx_reinforce.statistics import Estimate, enough
 from mjx_reinforce.statistics.comparisons import Comparison
 

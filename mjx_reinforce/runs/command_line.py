@@ -2,9 +2,9 @@
 
 import dataclasses
 import gc
-import os
+import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
@@ -14,23 +14,20 @@ from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.streams import accept_everything, say_error, silence_alarms
 from mjx_reinforce.runs.design import Design, SweepSettings, check_swept, read_design, read_over
-from mjx_reinforce.runs.directory import choose_directory
+from mjx_reinforce.runs.directory import locked
 from mjx_reinforce.settings.config import (
     Config,
-    changed,
     check_named,
-    check_read,
     code_flags,
-    is_read,
     read_seeds,
 )
-from mjx_reinforce.settings.defaults import flag_value, for_arguments, named_code
-from mjx_reinforce.settings.flags import about_word, asks_brief_help, cannot_load, read_command_line
-from mjx_reinforce.settings.groups import GROUPS, MAIN, UNUSUAL
-from mjx_reinforce.settings.tables import PRESETS
+from mjx_reinforce.settings.defaults import PRESETS, flag_value, for_arguments, named_code
+from mjx_reinforce.settings.flags import about_word, cannot_load, read_command_line
+from mjx_reinforce.settings.groups import GROUPS
 from mjx_reinforce.training import resume
 
 if TYPE_CHECKING:
+    from mjx_reinforce.report import WrittenReport
     from mjx_reinforce.runs.perform import Outcome
 
 
@@ -39,12 +36,10 @@ class _Program(NamedTuple):
 
     about: its description
     groups: its settings, dataclasses under their titles
-    main: those that --help alone shows, beside a run's own
     """
 
     about: str
     groups: Mapping[str, type]
-    main: Sequence[str] = ()
 
 
 _TRAIN = _Program(
@@ -63,65 +58,49 @@ _SWEEP = _Program(
     "and presets of python -m mjx_reinforce.train; most settings can be swept. Seed 3 of a "
     "configuration is seed 3 of train with these settings, up to rounding.",
     {"sweep": SweepSettings, **GROUPS},
-    ("over", "chunk_runs", "exact", "env", "env_steps", "num_seeds", "output", "resume"),
 )
+_PROGRAMS = {"train": _TRAIN, "sweep": _SWEEP}
 
 
-def parse(arguments: Sequence[str]) -> Design:
-    """Returns the run that a command line asks for; --help exits.
+def parse(arguments: Sequence[str], name: str = "train") -> Design:
+    """Returns the run or the sweep that a command line asks for; --help exits.
 
     Args:
       arguments: a preset's name, if any, then flags.
+      name: of the command, "train" or "sweep".
 
     Raises:
-      ValueError: there is no such preset or flag, a value is not of its type, a setting that is
-        given would do nothing, or the run to resume is not there, has other settings, was stopped,
-        or is of the user's own environment, which is to be named again.
+      ValueError: there is no such preset or flag, a value is not of its type, see ``read_over``;
+        or what is to go on is not there, has other settings, was stopped, or is of the user's own
+        code, which is to be named again.
     """
-    default, flags, prog = start(arguments, command("train"))
-    config, _ = _read(_TRAIN, flags, default, prog)
-    if config.minutes is not None and flag_value(flags, "--env-steps"):
+    default, flags, prog = start(arguments, command(name))
+    base, sweep = _read(_PROGRAMS[name], flags, default, prog)
+    if base.minutes is not None and flag_value(flags, "--env-steps"):
         raise ValueError(
-            f"--minutes {config.minutes:g} and --env-steps {config.env_steps} both say when the "
+            f"--minutes {base.minutes:g} and --env-steps {base.env_steps} both say when the "
             "run ends; leave one out"
         )
-    if (resumed := config.resume) is None:
-        check_read(config, changed(config, default))
-        return Design(base=config, default=default)
-    known = resume.read_settings(resumed)
-    config, _ = _read(_TRAIN, flags, known, prog)
-    check_read(config, changed(config, known))
-    resume.check_settings(known, config)
-    if resume.is_done(known, config):
+    if base.resume is None:
+        over = read_over(sweep.over)
+        if name == "sweep":
+            check_swept(over)
+        more = {"exact": sweep.exact, "chunk_runs": sweep.chunk_runs}
+        return Design(base=base, default=default, over=over, **more)
+    known = read_design(base.resume)
+    directory, own = base.resume, known.base
+    base, sweep = _read(_PROGRAMS[name], flags, own, prog)
+    if known.over and (base, sweep) != (own, SweepSettings()):
+        raise ValueError(f"the sweep in {directory} goes on as it is: give --resume alone")
+    resume.check_settings(own, base)
+    if not known.over and resume.is_done(own, base):
         print(
-            f"{resumed} is finished; to go on, give a larger --env-steps or --max-updates, or "
+            f"{directory} is finished; to go on, give a larger --env-steps or --max-updates, or "
             "--minutes"
         )
         sys.exit(0)
-    check_named(vars(known), named_code(arguments), resumed)
-    return Design(base=config)
-
-
-def parse_sweep(arguments: Sequence[str]) -> Design:
-    """Returns the sweep that a command line asks for; --help exits.
-
-    Args:
-      arguments: a preset's name, if any, then flags.
-
-    Raises:
-      ValueError: see ``parse`` and ``read_over``; or flags would change a sweep that goes on.
-    """
-    default, flags, prog = start(arguments, command("sweep"))
-    base, settings = _read(_SWEEP, flags, default, prog)
-    if base.resume is None:
-        over = read_over(settings.pop("over"))
-        check_swept(over)
-        return Design(base=base, default=default, over=over, **settings)
-    known = read_design(base.resume)
-    if _read(_SWEEP, flags, known.base, prog) != (known.base, vars(SweepSettings())):
-        raise ValueError(f"the sweep in {base.resume} goes on as it is: give --resume alone")
-    check_named(vars(known.base), named_code(flags), base.resume)
-    return known
+    check_named(vars(own), named_code(arguments), directory)
+    return dataclasses.replace(known, base=base, default=own)
 
 
 def start(arguments: Sequence[str], prog: str) -> tuple[Config, Sequence[str], str]:
@@ -154,15 +133,15 @@ def _default(arguments: Sequence[str]) -> Config:
         return for_arguments(arguments)
     if not (Path(like) / "config.json").is_file():
         raise ValueError(f"--like {like}: there is no run, for it has no config.json")
-    known = resume.read_settings(Path(like))
+    known = read_design(Path(like)).base
     check_named(vars(known), named_code(arguments), Path(like))
     return dataclasses.replace(known, resume=None)
 
 
 def _read(
     program: _Program, arguments: Sequence[str], default: Config, prog: str
-) -> tuple[Config, dict[str, Any]]:
-    """Returns the settings of a run as flags ask for them, and those that are no run's, by name.
+) -> tuple[Config, SweepSettings]:
+    """Returns the settings of a run, and those of a sweep, as flags ask for them.
 
     --help exits.
 
@@ -182,10 +161,8 @@ def _read(
         for title, group in program.groups.items()
     ]
     form = dataclasses.make_dataclass("Arguments", forms, frozen=True)
-    about, main = program.about, program.main or _main_settings(default)
-    if not asks_brief_help(arguments):
-        about = f"{about}\n\n{_names()}"
-    parsed = vars(read_command_line(form, arguments, prog, about, main))
+    about = f"{program.about}\n\n{_names()}"
+    parsed = vars(read_command_line(form, arguments, prog, about))
     found = {name: x for group in parsed.values() for name, x in vars(group).items()}
     config = Config(**{name: found.pop(name) for name in known})
     if config.seeds is not None:
@@ -194,18 +171,11 @@ def _read(
                 f"--seeds {config.seeds} says how many seeds there are: leave --num-seeds out"
             )
         config = dataclasses.replace(config, num_seeds=len(read_seeds(config.seeds)))
-    return config, found
-
-
-def _main_settings(default: Config) -> list[str]:
-    """Returns what --help alone shows of the settings with these defaults."""
-    own = changed(default, Config())
-    unusual = [name for cause, shown in UNUSUAL.items() if cause in own for name in shown]
-    return [*(name for name in MAIN if is_read(name, default)), *unusual]
+    return config, SweepSettings(**found)
 
 
 def _names() -> str:
-    """Returns the presets and the tasks, for --help all."""
+    """Returns the presets and the tasks, for --help."""
     width = max(map(len, PRESETS))
     presets = "\n".join(f"  {name:{width}}  {line}" for name, (line, _) in PRESETS.items())
     return (
@@ -214,49 +184,53 @@ def _names() -> str:
     )
 
 
-def train_to_the_end(
-    read: Callable[[Sequence[str]], Design], end: Callable[["Outcome"], object]
-) -> NoReturn:
-    """Does what a command line asks for, and exits.
+def train() -> None:
+    """Does what ``python -m mjx_reinforce.train`` does."""
+    _do("train")
+
+
+def sweep() -> None:
+    """Does what ``python -m mjx_reinforce.sweep`` does."""
+    _do("sweep")
+
+
+def _do(name: str) -> NoReturn:
+    """Does what the command line of a command asks for, says what came of it, and exits.
 
     The status is 0 when done, 1 if files cannot be written or nothing is finite any more, 2 for bad
     input, 130 after Ctrl-C and 143 after SIGTERM.
 
     Args:
-      read: the words of the command line -> what it asks for.
-      end: says what came of it.
+      name: of the command, "train" or "sweep".
     """
     accept_everything()
     silence_alarms()
+    # Imports and tracing make many objects and little garbage: that saves a second in eight.
+    gc.set_threshold(100_000)
     with Interrupt() as interrupt:
-        # Imports and tracing make many objects and no garbage: that saves a second in eight.
-        gc.disable()
-        try:
-            status = _train(read, end, interrupt)
-        finally:
-            gc.enable()
+        status = _train(name, interrupt)
     sys.exit(status)
 
 
-def _train(
-    read: Callable[[Sequence[str]], Design],
-    end: Callable[["Outcome"], object],
-    interrupt: Interrupt,
-) -> int:
+def _train(name: str, interrupt: Interrupt) -> int:
     """Returns the exit status of a command line."""
     try:
-        design = _in_a_directory(read(sys.argv[1:]))
-        from mjx_reinforce.runs.perform import perform
+        design = parse(sys.argv[1:], name)
     except ValueError as error:
         refuse(str(error))
+    outcome = None
     try:
-        outcome = perform(design, interrupt, compiled=_collect_again)
-        end(outcome)
-    except ValueError as error:
-        refuse(str(error))
-    except (ImportError, MemoryError) as error:
+        from mjx_reinforce.runs.perform import perform
+
+        outcome = perform(design, interrupt)
+        report_on(outcome)
+    except ImportError as error:
         refuse(cannot_load(error))
-    except (RuntimeError, OSError) as error:
+    except ValueError as error:
+        if outcome is None and interrupt.deferred():
+            raise  # in training: it is a mistake of this program
+        refuse(str(error))
+    except (RuntimeError, MemoryError, OSError) as error:
         _refuse_full(error, design)
     if outcome.summary["status"] != "interrupted" or interrupt.number is None:
         return int(outcome.summary["status"] == "stopped")
@@ -265,35 +239,18 @@ def _train(
     return 128 + interrupt.number
 
 
-def _in_a_directory(design: Design) -> Design:
-    """Returns a design that says where its directory is."""
-    base = design.base
-    if base.resume is None:
-        base = dataclasses.replace(base, output=choose_directory(base.output, base.env))
-    return dataclasses.replace(design, base=base)
-
-
-def _collect_again() -> None:
-    """Starts the garbage collector, which never looks again at the objects that are there."""
-    gc.freeze()
-    gc.enable()
-
-
-def _refuse_full(error: RuntimeError | OSError, design: Design) -> NoReturn:
+def _refuse_full(error: RuntimeError | MemoryError | OSError, design: Design) -> NoReturn:
     """Refuses what met a full memory or disk, as ``refuse``; raises any other error again."""
     if isinstance(error, OSError):
-        directory, what = design.resume or design.base.output, "sweep" if design.over else "run"
-        again = "try again"
-        if directory is not None and (directory / design.first_file).exists():
-            again = f"go on with --resume {directory}{code_flags(vars(design.base))}"
+        what, again = "sweep" if design.over else "run", "try again"
+        if (design.directory / design.first_file).exists():
+            again = f"go on with --resume {design.directory}{code_flags(vars(design.base))}"
         room = "make room, then" if error.errno else "then"  # W&B's have no number
         refuse(f"cannot write the files of this {what} ({error}); {room} {again}", status=1)
-    if "RESOURCE_EXHAUSTED" not in str(error):
+    if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
         raise error
     part, flag = ("a chunk", "--chunk-runs") if design.over else ("this run", "--num-seeds")
     flags = f"{flag}, --num-episodes, --eval-episodes or --horizon"
-    if os.environ.get("XLA_PYTHON_CLIENT_PREALLOCATE", "").lower() in ("false", "0"):
-        flags += "; or unset XLA_PYTHON_CLIENT_PREALLOCATE, with which memory is in pieces"
     refuse(f"{part} does not fit into memory ({error}); lower {flags}")
 
 
@@ -301,3 +258,49 @@ def refuse(message: str, status: int = 2) -> NoReturn:
     """Says in one line what is wrong, and exits."""
     say_error(message)
     sys.exit(status)
+
+
+def report_on(outcome: "Outcome", *, report: bool = True) -> None:
+    """Says what a run or a sweep found, whose report is written, if that is asked for."""
+    display, directory, summary = outcome.display, outcome.directory, outcome.summary
+    assert directory is not None
+    if "over" not in summary:
+        display.show_summary(summary, directory)
+        return
+    if summary["status"] == "interrupted":
+        flags = code_flags(summary["settings"])
+        display.say(f"interrupted; go on with --resume {directory}{flags}")
+        return
+    if outcome.driver is None and (directory / "report.html").exists():
+        display.say(f"the sweep in {directory} is finished")
+        return
+    took = (
+        f"compiling took {summary['compile_seconds']:.1f} s, training and evaluating "
+        f"{summary['run_seconds']:.1f} s"
+    )
+    if not report:
+        display.say(f"{took}. Files in {directory}")
+        return
+    display.say("writing the report")
+    with locked(directory):
+        written = _report(directory)
+    took += f", statistics and report {written.seconds:.1f} s"
+    for sentence in (*written.answer, f"{took}. Files in {directory}, first report.html"):
+        display.say(sentence)
+    display.show_commands(_watch(directory, written.best, summary["settings"]))
+
+
+def _report(directory: Path) -> "WrittenReport":
+    """Writes the report of a sweep; removes what a crash left of writing it."""
+    from mjx_reinforce import report
+
+    for part in [*directory.glob(".report.html.*"), *(directory / "report").glob(".*")]:
+        part.unlink()
+    return report.write_report([directory], directory / "report.html")
+
+
+def _watch(directory: Path, number: int, settings: Mapping[str, Any]) -> dict[str, str]:
+    """Returns the command that plays the best policy of a configuration, after what it does."""
+    place = shlex.quote(str(directory / "policies" / f"{number:03d}"))
+    named = code_flags({name: settings[name] for name in ("env", "policy")})
+    return {"To see the best of it play": f"{command('watch')} {place}{named}"}

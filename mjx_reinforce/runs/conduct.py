@@ -17,10 +17,9 @@ from mjx_reinforce.runs.saving import Files
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.store.ready import Ready
 from mjx_reinforce.training.checkpoint import Checkpoint
-from mjx_reinforce.training.driver import Driver, Observer, Training, check_layout
-from mjx_reinforce.training.progress import HOPELESS, Progress
-from mjx_reinforce.training.record import ChunkRecord, RunRecord, Runs
-from mjx_reinforce.training.slots import Compiled, Slots, Stopwatch, compile_slots, started
+from mjx_reinforce.training.driver import Driver, Observer, Runs, Training, check_layout
+from mjx_reinforce.training.record import HOPELESS, Record, RunRecord
+from mjx_reinforce.training.slots import Compiled, Slots, compile_slots, started
 from mjx_reinforce.training.state import Budget, begin_with, budget_of, last_actors
 
 
@@ -45,24 +44,22 @@ class Conductor(Observer[Training]):
         self._prepared, self._files, self._display = prepared, files, display
         written = [] if files is None else [files]
         self._observers = [*written, display if prepared.alone else self, *observers]
-        self._clock = Stopwatch()
+        self._clock = prepared.clock
         #: The groups that have runs to be trained, and these in chunks.
         self._stages: list[tuple[Part, list[Runs]]] = []
         for part in prepared.parts:
             if left := [x for x in part.chunks if not (files is not None and files.has(x.name))]:
                 self._stages.append((part, left))
-        self._done, self._total = 0.0, 0.0
-        for part, left in self._stages:
-            self._total += _cost(part) * sum(len(runs.seed) for runs in left)
+        #: Runs that have ended here, of how many.
+        self._done, self._total = 0, sum(len(x.seed) for _, left in self._stages for x in left)
         #: The programs of the group that is next.
         self._next: Future[Compiled] = Future()
 
     def compile_first(self) -> None:
         """Compiles the programs of the first group, if any runs are left, as the caller would."""
         if self._stages:
-            began = time.perf_counter()
             self._next.set_result(self._compile(self._stages[0][0]))
-            self._clock.compiling += time.perf_counter() - began
+        self._clock.compiling = time.perf_counter() - self._clock.began
 
     def conduct(self, interrupted: Callable[[], bool]) -> tuple[Training | None, dict[str, Any]]:
         """Trains all groups, to their end or until they are interrupted.
@@ -75,45 +72,40 @@ class Conductor(Observer[Training]):
         """
         if self._files is not None:
             self._files.open()
-        self._display.start(self._seconds())
+        self._display.start(self._clock.compiling)
         driver, ended = None, True
         for part, runs, compiled in self._chunks():
-            began, waited = time.perf_counter(), self._clock.compiling
             driver = self._begin(part, runs, compiled, interrupted)
             driver.drive(interrupted)
             for observer in self._observers:
                 observer.ended(driver)
-            waited = self._clock.compiling - waited
-            self._clock.running += time.perf_counter() - began - waited
             ended = driver.record.done()
             if not ended:
                 break
-            self._done += _cost(part) * len(runs.seed)
+            self._done += len(runs.seed)
         if isinstance(driver, Driver):
             # A signal after that changes nothing: what is left takes a second or two.
             test, engine = driver.test(interrupted), self._prepared.parts[0].ready.engine
-            summary = summary_of(driver, engine, self._seconds(), test)
+            summary = summary_of(driver, engine, self._clock.compiling, test)
         else:
             assert self._files is not None
             summary = dict(self._files.contents, status="finished" if ended else "interrupted")
-            summary["compile_seconds"] += self._seconds()
-            summary["run_seconds"] += self._clock.running
+            summary["compile_seconds"] += self._clock.compiling
+            summary["run_seconds"] += self._clock.running()
         for observer in self._observers:
             observer.finished(driver, summary)
         return driver, summary
 
     def updated(self, driver: Training, met: np.ndarray) -> None:
         """Shows how far a sweep is."""
-        self._display.show_progress(self._progress(driver))
-
-    def _seconds(self) -> float:
-        """Returns the wall time that compiling took so far."""
-        return self._prepared.engine_seconds + self._clock.compiling
+        done = (self._done + np.minimum(driver.record.used(), 1.0).sum()) / self._total
+        left = self._clock.running() * (1 - done) / done if done > 0 else float("nan")
+        now = driver.record.progress()._replace(fraction=float(done), seconds_left=left)
+        self._display.show_progress(now)
 
     def _compile(self, part: Part) -> Compiled:
         """Returns the programs of a group."""
-        programs, config = part.ready.programs(), part.group.config
-        return compile_slots(programs, config, part.widths, self._clock)
+        return compile_slots(part.ready.programs(), part.group.config, part.width)
 
     def _chunks(self) -> Iterator[tuple[Part, Runs, Compiled]]:
         """Yields the chunks that are left, with the programs of their group."""
@@ -130,21 +122,21 @@ class Conductor(Observer[Training]):
         """Returns the runs of a chunk where they go on; says which they are."""
         config = dataclasses.replace(part.group.config, num_seeds=len(runs.seed))
         settings = {name: values[runs.place] for name, values in part.group.settings.items()}
-        slots = Slots(compiled, runs.seed, settings)
+        slots, say = Slots(compiled, runs.seed, settings), self._display.say
         if self._prepared.alone:
-            found, say = self._prepared.found, self._display.say
-            driver = begin_run(config, part.ready, slots, found, say, self._observers, interrupted)
+            given = config, part.ready, slots, runs, self._prepared.found, say
+            driver = begin_run(*given, self._observers, interrupted)
         else:
-            driver = Training(config, slots, ChunkRecord(config, runs), self._observers)
+            driver = Training(config, slots, Record(config), runs, self._observers)
         for observer in self._observers:
             observer.began(driver)
         if not self._prepared.alone:
-            self._display.say(self._heading(runs))
+            say(self._heading(runs))
         return driver
 
     def _heading(self, runs: Runs) -> str:
         """Returns which configurations the lines that follow are of."""
-        every = self._prepared.design.configurations()
+        every = self._prepared.design.configurations
         here = [every[number] for number in np.unique(runs.configuration)]
         values = {name: [*dict.fromkeys(say(values[name]) for values in here)] for name in here[0]}
         count = f"{counted(len(here), 'configuration')} of {len(every):,}"
@@ -152,24 +144,12 @@ class Conductor(Observer[Training]):
         said = (f"{setting_in_words(name)} {', '.join(x)}" for name, x in few.items())
         return f"{'; '.join(said)} ({count}, {counted(len(runs.seed), 'run')})"
 
-    def _progress(self, driver: Training) -> Progress:
-        """Returns how far a chunk is, but with the fraction and the time left of the sweep."""
-        now, cost = driver.record.progress(), driver.config.env_steps or 1
-        done = (self._done + cost * now.num_seeds * now.fraction) / self._total
-        passed = self._clock.running + driver.record.seconds
-        left = passed * (1 - done) / done if done > 0 else float("nan")
-        return now._replace(fraction=done, seconds_left=left)
-
-
-def _cost(part: Part) -> int:
-    """Returns what a run of a group counts for in the progress of the sweep: its budget."""
-    return part.group.config.env_steps or 1
-
 
 def begin_run(
     config: Config,
     ready: Ready,
     slots: Slots,
+    runs: Runs,
     found: Checkpoint | None = None,
     say: Callable[[str], None] = lambda text: None,
     observers: Sequence[Observer[Any]] = (),
@@ -181,6 +161,7 @@ def begin_run(
       config: its settings.
       ready: what it is made of.
       slots: its seeds.
+      runs: the same, by their numbers.
       found: the checkpoint from which it goes on, if any; an observer takes it back there.
       say: shows a line to the user.
       observers: who sees it.
@@ -200,7 +181,7 @@ def begin_run(
         config = dataclasses.replace(config, env_steps=env_steps, minutes=None)
     slots.budget = budget_of(config)
     config = dataclasses.replace(config, horizon=ready.horizon)
-    return Driver(config, slots, RunRecord(config, ready.threshold), observers)
+    return Driver(config, slots, RunRecord(config, ready.threshold), runs, observers)
 
 
 #: The part of the time in which its speed is measured; what is trained in it is trained again.

@@ -2,18 +2,20 @@
 
 import contextlib
 import dataclasses
+import datetime
+import functools
 import itertools
 import math
-import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
 from mjx_reinforce.console.commands import command
-from mjx_reinforce.engine.checks import alternatives, check_name, nearest, read_as
+from mjx_reinforce.engine.checks import check_name, nearest, read_as, spoken_kind
 from mjx_reinforce.engine.memory import gigabytes, host_memory
+from mjx_reinforce.files import naming_damage
 from mjx_reinforce.runs.sinks import check_installed
 from mjx_reinforce.settings.config import (
     Config,
@@ -22,6 +24,7 @@ from mjx_reinforce.settings.config import (
     check_each,
     check_read,
     flag,
+    is_read,
     spoken,
 )
 from mjx_reinforce.settings.groups import LogSettings
@@ -73,6 +76,13 @@ class Design:
         """The directory in which it goes on, if it does."""
         return self.base.resume
 
+    @functools.cached_property
+    def directory(self) -> Path:
+        """Where its files are; ``runs/<env>-<time>`` if nobody said."""
+        stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S-%f")[:-3]
+        named = Path("runs") / f"{self.base.env.replace(':', '.')}-{stamp}"
+        return self.resume or self.base.output or named
+
     @property
     def first_file(self) -> str:
         """The name of the file with which its directory begins."""
@@ -82,9 +92,16 @@ class Design:
         """Returns how many configurations it has."""
         return math.prod(map(len, self.over.values()))
 
+    @functools.cached_property
     def configurations(self) -> list[dict[str, Any]]:
-        """Returns the values of what is swept, in each configuration."""
-        return grid(self.over)
+        """The values of what is swept, in each configuration; the last changes fastest."""
+        every = itertools.product(*self.over.values())
+        return [dict(zip(self.over, values, strict=True)) for values in every]
+
+    @functools.cached_property
+    def configs(self) -> list[Config]:
+        """The settings of each configuration."""
+        return [_with_values(self.base, values) for values in self.configurations]
 
 
 def as_record(design: Design) -> dict[str, Any]:
@@ -97,25 +114,31 @@ def as_record(design: Design) -> dict[str, Any]:
 
 
 def read_design(directory: Path) -> Design:
-    """Returns the design of the sweep in a directory.
+    """Returns the design of the run or the sweep in a directory, for going on with it.
 
     Raises:
-      ValueError: there is none, or its sweep.json is damaged or of another version.
+      ValueError: there is none, or its first file is damaged or of another version.
     """
-    path, record = directory / "sweep.json", read_record(directory, "sweep.json")
-    try:
+    record = read_record(directory)
+    if "over" not in record:
+        base = as_config(record, directory / "config.json")
+        return Design(base=dataclasses.replace(base, resume=directory))
+    path = directory / "sweep.json"
+    with naming_damage(path):
+        settings, exact = record["settings"], record["exact"]
         over = {
             name: [tuple(x) if isinstance(x, list) else x for x in values]
             for name, values in record["over"].items()
         }
-        base = dataclasses.replace(as_config(record["settings"], path), resume=directory)
-        return Design(base=base, over=over, exact=record["exact"])
-    except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path} is damaged: {error!r}") from error
+    base = dataclasses.replace(as_config(settings, path), resume=directory)
+    return Design(base=base, over=over, exact=exact)
 
 
 def check_design(design: Design) -> None:
-    """Raises ValueError for what makes no sense, before anything heavy is imported."""
+    """Raises ValueError for what makes no sense, before anything heavy is imported.
+
+    A configuration reads each setting that is swept, and one of them each that was given.
+    """
     check_each(design.base)
     if design.over:
         _check_sweep(design)
@@ -126,7 +149,12 @@ def check_design(design: Design) -> None:
             f"{gigabytes(runs * _RESULT)}, {gigabytes(host_memory())} are here; lower --num-seeds "
             "or the number of values after --over"
         )
-    configure(design.base, design.configurations(), design.given)
+    for config, values in zip(design.configs, design.configurations, strict=True):
+        check(config)
+        check_read(config, values or design.given)
+    for name in set(design.given).difference(design.over):
+        if not any(is_read(name, config) for config in design.configs):
+            check_read(design.configs[0], [name])
     check_installed(design.base)
 
 
@@ -183,12 +211,7 @@ def _unknown(word: str) -> str:
     """Returns the message about a word that is no setting."""
     near = nearest(word, [spoken(name) for name in _FIELDS])
     hint = f" Did you mean {near!r}?" if near else ""
-    return f"unknown setting {word!r} after --over.{hint} (--help all lists the settings.)"
-
-
-def grid(over: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
-    """Returns every combination of the values; the last setting changes fastest."""
-    return [dict(zip(over, values, strict=True)) for values in itertools.product(*over.values())]
+    return f"unknown setting {word!r} after --over.{hint} (--help lists the settings.)"
 
 
 def check_swept(over: Mapping[str, Sequence[Any]]) -> None:
@@ -224,31 +247,6 @@ def check_over(base: Config, over: Mapping[str, Sequence[Any]]) -> None:
             raise ValueError(f"--over {spoken(name)} has the value {twice[0]} twice")
 
 
-def configure(
-    base: Config, configurations: Sequence[Mapping[str, Any]], given: Sequence[str] = ()
-) -> list[Config]:
-    """Returns the settings of each configuration.
-
-    Args:
-      base: what they share.
-      configurations: the values of what is swept.
-      given: settings of the base that the user chose.
-
-    Raises:
-      ValueError: the settings of a configuration make no sense; it does not read a setting that is
-        swept; or none of them reads one that was given.
-    """
-    configs = [_with_values(base, values) for values in configurations]
-    for config, values in zip(configs, configurations, strict=True):
-        check(config)
-        check_read(config, values)
-    for name in set(given).difference(*configurations[:1]):
-        idle = [error for config in configs if (error := _not_read(config, name))]
-        if len(idle) == len(configs):
-            raise idle[0]
-    return configs
-
-
 def _with_values(base: Config, values: Mapping[str, Any]) -> Config:
     """Returns settings with other values, also of settings of the environment."""
     plain = {name: value for name, value in values.items() if not _of_env(name)}
@@ -260,15 +258,6 @@ def _with_values(base: Config, values: Mapping[str, Any]) -> Config:
     return dataclasses.replace(config, env_set=(*kept, *given.values()))
 
 
-def _not_read(config: Config, name: str) -> ValueError | None:
-    """Returns the error of a configuration that does not read a setting."""
-    try:
-        check_read(config, [name])
-    except ValueError as error:
-        return error
-    return None
-
-
 def _value(name: str, word: str) -> Any:
     """Returns a word of the command line as a value of a setting's type.
 
@@ -278,16 +267,6 @@ def _value(name: str, word: str) -> Any:
     with contextlib.suppress(ValueError):
         return read_as(kind, word)
     spaces = "; write spaces between values" if "," in word else ""
-    said = _kind(alternatives(kind))
-    raise ValueError(f"--over {spoken(name)} has the value {word!r}, which is no {said}{spaces}")
-
-
-def _kind(kinds: Sequence[Any]) -> str:
-    names = {int: "whole number", float: "number", type(None): "None"}
-    spoken = [
-        " or ".join(typing.get_args(kind))
-        if typing.get_origin(kind) is Literal
-        else names.get(kind, "list of numbers such as 32,32 (or none)")
-        for kind in kinds
-    ]
-    return " or ".join(spoken)
+    raise ValueError(
+        f"--over {spoken(name)} has the value {word!r}, not {spoken_kind(kind)}{spaces}"
+    )

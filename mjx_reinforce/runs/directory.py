@@ -1,7 +1,6 @@
 """The directory of a run: made, checked, locked."""
 
 import contextlib
-import datetime
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -16,18 +15,11 @@ except ImportError as error:
     ) from error
 
 from mjx_reinforce.console.interrupt import Interrupt
-from mjx_reinforce.settings.config import Config
 
 #: What a kill leaves of the first file of a run or a sweep, which then was not begun.
 _FIRST = (".config.json.", ".sweep.json.")
 #: A disk with less room (bytes) is full: the files of a small run take about as much.
 _ROOM = 2**20
-
-
-def choose_directory(output: Path | None, env: str) -> Path:
-    """Returns the run directory: ``output``, or ``runs/<env>-<time>`` if it is None."""
-    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S-%f")[:-3]
-    return Path("runs") / f"{env.replace(':', '.')}-{stamp}" if output is None else output
 
 
 def make_directory(directory: Path) -> list[Path]:
@@ -47,9 +39,8 @@ def make_directory(directory: Path) -> list[Path]:
                 f"the run directory {directory} would be inside the run {outer}; choose another "
                 "--output"
             )
-        for folder in (*reversed(directory.parents), directory):
-            if _make(folder):
-                made.insert(0, folder)
+        made = [folder for folder in (directory, *directory.parents) if not folder.exists()]
+        directory.mkdir(parents=True, exist_ok=True)
         # Where a run was killed as it wrote its first file, nothing was begun.
         names = [path.name for path in directory.iterdir()]
         if any(not name.startswith(_FIRST) for name in names):
@@ -64,20 +55,6 @@ def make_directory(directory: Path) -> list[Path]:
             "make room there, or choose another --output"
         ) from error
     return made
-
-
-def _make(folder: Path) -> bool:
-    """Makes a folder if it is not there; returns whether it was made, and by no other process."""
-    if folder.is_dir():
-        return False
-    try:
-        folder.mkdir()
-    except FileExistsError:
-        if not folder.is_dir():
-            folder.stat()  # says what is wrong with a link
-            raise
-        return False
-    return True
 
 
 def _run_around(directory: Path) -> Path | None:
@@ -113,28 +90,28 @@ def remove_empty(folders: Sequence[Path]) -> None:
 
 
 @contextlib.contextmanager
-def own_directory(config: Config, resumed: Path | None, interrupt: Interrupt) -> Iterator[Path]:
+def own_directory(directory: Path, interrupt: Interrupt, *, resumed: bool) -> Iterator[None]:
     """Makes the directory of a run or sweep, and keeps other processes out of it.
 
     Folders that were made and stay empty are removed at the end.
 
     Args:
-      config: the settings, which say where it is.
-      resumed: the directory in which it goes on, if it does.
+      directory: of it.
       interrupt: also removes them.
+      resumed: whether it goes on there.
 
     Raises:
       ValueError: see ``make_directory``, ``check_writable`` and ``locked``.
     """
-    directory, made = resumed or choose_directory(config.output, config.env), []
-    if resumed is None:
-        made = make_directory(directory)
-    else:
+    made: list[Path] = []
+    if resumed:
         check_writable(directory)
+    else:
+        made = make_directory(directory)
     with locked(directory):  # a folder in which another trains stays
         interrupt.on_exit(lambda: remove_empty(made))
         try:
-            yield directory
+            yield
         finally:
             remove_empty(made)
 

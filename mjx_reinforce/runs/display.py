@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console, RenderableType
-from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
@@ -20,7 +19,7 @@ from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.streams import heartbeat
 from mjx_reinforce.settings.config import env_flag
 from mjx_reinforce.statistics import enough, iqm
-from mjx_reinforce.training import progress
+from mjx_reinforce.training import record
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer
 from mjx_reinforce.training.record import Cells
 
@@ -73,20 +72,43 @@ class Display(Observer[Driver]):
         """Leaves the last state on the screen."""
         self._bar.stop()
 
-    def say(self, text: str, style: str | None = None) -> None:
-        """Prints a sentence above the bar, in one of rich's styles; without a terminal, as a line.
+    def say(self, text: str | Table, style: str | None = None, *, whole: bool = False) -> None:
+        """Prints a sentence or a table above the bar.
 
         A line that the screen does not take is lost: it may be a file on a full disk, or a pipe
         that nobody reads, which is no reason to end a run.
+
+        Args:
+          text: is wrapped on a terminal, and a line elsewhere.
+          style: one of rich's.
+          whole: wrap it nowhere: it is to be copied.
         """
         with suppress(OSError):
-            whole = not self.console.is_terminal
+            whole |= not self.console.is_terminal
             self.console.print(text, style=style, highlight=False, soft_wrap=whole)
 
     def show_commands(self, commands: Mapping[str, str]) -> None:
         """Prints command lines after what they do; each is one line, to be copied."""
-        with suppress(OSError):
-            print_commands(self.console, commands)
+        for purpose, line in commands.items():
+            self.say(f"{purpose}:  {line}", whole=True)
+
+    def show_summary(self, summary: dict[str, Any], directory: Path) -> None:
+        """Says what a run learned, where its files are, and what can be done with them."""
+        self.say(summary_table(summary))
+        own = env_flag(summary["env"])
+        if summary["status"] == "interrupted":
+            self.say(f"Interrupted: go on with --resume {directory}{own}", whole=True)
+            return
+        self.say(f"Files in {directory}; the picture is learning_curve.png.")
+        where = shlex.quote(str(directory))
+        self.show_commands(
+            {
+                "To see the best seed play": f"{command('watch')} {where}{own}",
+                "For a page of all figures": f"{command('report')} {where}",
+            }
+        )
+        if summary["status"] == "stopped":
+            self.say(f"stopped: {summary['reason']}", "red")
 
     def compiling(self) -> AbstractContextManager[None]:
         """Returns a ``with`` block that shows that its contents are still running."""
@@ -97,7 +119,7 @@ class Display(Observer[Driver]):
         self.say(f"compiled in {compile_seconds:.1f} s")
         self._bar.reset(self._task, total=1.0, description="training", done="", left="")
 
-    def show_progress(self, now: progress.Progress) -> None:
+    def show_progress(self, now: record.Progress) -> None:
         """Shows how far the run is and how well it does."""
         self._bar.line, left = _returns_and_speed(now), _time_left(now)
         done = percent_done(min(now.fraction, 1.0))
@@ -111,7 +133,7 @@ class Display(Observer[Driver]):
     def updated(self, driver: Driver, met: np.ndarray) -> None:
         """Says in a line which seeds met numbers that are not finite, if any did."""
         if met.any():
-            said = progress.describe_nonfinite(met, driver.config.first_seed, driver.updates())
+            said = record.describe_nonfinite(met, driver.config.first_seed, driver.updates())
             self.say(said, "yellow")
 
     def evaluated(self, driver: Driver, evaluation: Evaluation, rows: Cells) -> None:
@@ -119,17 +141,17 @@ class Display(Observer[Driver]):
         self.show_progress(driver.record.progress())
 
 
-def _returns_and_speed(now: progress.Progress) -> str:
-    """Returns the returns and, after a block of updates, the speed."""
+def _returns_and_speed(now: record.Progress) -> str:
+    """Returns the returns and, after a block of updates, the mean speed."""
     text = f"return {now.iqm:7.1f}  worst {now.worst:7.1f}"
     if now.failed:
         text = f"return {now.iqm:7.1f}  worst nan ({now.failed:,} of {now.num_seeds:,} seeds)"
-    if not math.isnan(now.latest_per_second):
-        text += f"  {now.latest_per_second:,.0f} steps/s, mean {now.env_steps_per_second:,.0f}"
+    if not math.isnan(now.env_steps_per_second):
+        text += f"  {now.env_steps_per_second:,.0f} steps/s"
     return text
 
 
-def _time_left(now: progress.Progress) -> str:
+def _time_left(now: record.Progress) -> str:
     """Returns how long the run still takes, empty where nobody knows."""
     if math.isnan(now.seconds_left):
         return ""
@@ -142,10 +164,10 @@ def percent_done(fraction: float) -> str:
     return f"{100 * shown:.1f} %"
 
 
-def print_summary(console: Console, summary: dict[str, Any], directory: Path) -> None:
-    """Prints the table that ends a run, and where its files are."""
+def summary_table(summary: dict[str, Any]) -> Table:
+    """Returns the table that ends a run."""
     num_seeds = f"{summary['num_seeds']:,}"
-    table = Table(title=escape(f"{summary['env']}, {num_seeds} seeds"), show_header=False)
+    table = Table(title=f"{summary['env']}, {num_seeds} seeds", show_header=False)
     low, high = summary["iqm_ci"]
     known = math.isfinite(low) and math.isfinite(high)
     interval = f"95 % interval {low:.1f} to {high:.1f}" if known else "no interval"
@@ -156,17 +178,12 @@ def print_summary(console: Console, summary: dict[str, Any], directory: Path) ->
     if failed := summary["seeds_nonfinite_at_end"]:
         row = f"{failed:,} of {num_seeds}, worse than every other"
         table.add_row("seeds whose return is not finite", row)
-    if summary["seeds_solved_at_end"] is not None:
-        at_end, ever = summary["seeds_solved_at_end"], summary["seeds_ever_solved"]
-        table.add_row(
-            f"seeds at {summary['threshold']:,g}, the task's threshold",
-            f"{at_end:,} of {num_seeds} at the end, {ever:,} ever",
-        )
-        for unit in ("env_steps", "episodes"):
-            solved = [count for count in summary[f"{unit}_to_solve"] if count is not None]
-            if solved:
-                name = f"{unit.replace('_', ' ')} to solve"
-                table.add_row(name, f"{min(solved):,} to {max(solved):,}")
+    if (at_end := summary["seeds_solved_at_end"]) is not None:
+        row = f"{at_end:,} of {num_seeds} at the end, {summary['seeds_ever_solved']:,} ever"
+        table.add_row(f"seeds at {summary['threshold']:,g}, the task's threshold", row)
+        solved = [count for count in summary["env_steps_to_solve"] if count is not None]
+        if solved:
+            table.add_row("env steps to solve", f"{min(solved):,} to {max(solved):,}")
     if "final_test_returns" in summary:
         last, best = (iqm(np.array(summary[f"{kind}_test_returns"])) for kind in ("final", "best"))
         table.add_row("last policies on fresh starts", f"{last:.1f}")
@@ -177,22 +194,4 @@ def print_summary(console: Console, summary: dict[str, Any], directory: Path) ->
     table.add_row("steps of episodes, of all simulated", useful)
     table.add_row("compiling", f"{summary['compile_seconds']:.1f} s")
     table.add_row("training and evaluating", f"{summary['run_seconds']:.1f} s")
-    console.print(table)
-    if summary["status"] == "interrupted":
-        said = f"Interrupted: go on with --resume {directory}{env_flag(summary['env'])}"
-        console.print(said, markup=False, highlight=False, soft_wrap=True)
-        return
-    said = f"Files in {directory}; the picture is learning_curve.png."
-    console.print(said, markup=False, highlight=False, soft_wrap=not console.is_terminal)
-    where = shlex.quote(str(directory))
-    commands = {
-        "To see the best seed play": f"{command('watch')} {where}{env_flag(summary['env'])}",
-        "For a page of all figures": f"{command('report')} {where}",
-    }
-    print_commands(console, commands)
-
-
-def print_commands(console: Console, commands: Mapping[str, str]) -> None:
-    """Prints command lines after what they do; each is one line, to be copied."""
-    for purpose, line in commands.items():
-        console.print(f"{purpose}:  {line}", markup=False, highlight=False, soft_wrap=True)
+    return table

@@ -1,7 +1,7 @@
 """A run or a sweep from its design to its files: what the commands and Python have in common."""
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -9,7 +9,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.console.streams import heartbeat
-from mjx_reinforce.runs.design import Design, check_design, configure
+from mjx_reinforce.runs.design import Design, check_design
 from mjx_reinforce.runs.directory import own_directory
 from mjx_reinforce.training.resume import read_record
 
@@ -42,7 +42,6 @@ def perform(
     *,
     files: bool = True,
     quiet: bool = False,
-    compiled: Callable[[], object] = lambda: None,
 ) -> Outcome:
     """Trains a run or a sweep, or goes on with it, to the budget, a signal, or past hope.
 
@@ -52,7 +51,6 @@ def perform(
       observers: who sees it, besides its files and the screen.
       files: whether it has a directory, whose name may be left to us.
       quiet: show no progress.
-      compiled: called once what comes first is compiled.
 
     Raises:
       ValueError: the design makes no sense here, or it cannot go on.
@@ -60,23 +58,21 @@ def perform(
     """
     check_design(design)
     with contextlib.ExitStack() as held:
-        directory, base = None, design.base
-        if files:
-            directory = held.enter_context(own_directory(base, design.resume, interrupt))
+        directory, resumed = design.directory if files else None, design.resume is not None
+        if directory is not None:
+            held.enter_context(own_directory(directory, interrupt, resumed=resumed))
+        known = read_record(design.directory) if resumed else {}
+        if known.get("status") == "finished":  # of a sweep
+            return Outcome(directory, known, None, {}, _display(quiet=quiet))
         # A module of the user's is imported before JAX starts, which it may set up.
-        first = configure(base, design.configurations())[0]
+        first = design.configs[0]
         env = None if envs.is_ours(first.env) else envs.make_set(first.env, first.env_set)
         configure_jax()
         from mjx_reinforce.runs.conduct import Conductor
-        from mjx_reinforce.runs.display import Display
         from mjx_reinforce.runs.plan import describe, prepare
-        from mjx_reinforce.runs.run_files import RunFiles
-        from mjx_reinforce.runs.sweep_files import SweepFiles
+        from mjx_reinforce.runs.saving import RunFiles, SweepFiles
 
-        display = Display(quiet=quiet)
-        known = {} if design.resume is None else read_record(design.resume, design.first_file)
-        if known.get("status") == "finished":  # of a sweep
-            return Outcome(directory, known, None, {}, display)
+        display = _display(quiet=quiet)
         with heartbeat(display.say, "writing the simulation out"):
             prepared = prepare(design, known, env, display.say)
         display.say(describe(prepared))
@@ -87,8 +83,14 @@ def perform(
             conductor = Conductor(prepared, written, display, observers)
             with display.compiling():
                 conductor.compile_first()
-            compiled()
             # Not before: a kill while it compiles leaves nothing that would refuse the next.
             interrupt.defer(display.say)
             driver, summary = conductor.conduct(interrupt.heard)
         return Outcome(directory, summary, driver, prepared.parts[0].ready.policy, display)
+
+
+def _display(*, quiet: bool) -> "Display":
+    """Returns a screen; what draws it is imported late."""
+    from mjx_reinforce.runs.display import Display
+
+    return Display(quiet=quiet)

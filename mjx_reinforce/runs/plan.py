@@ -5,7 +5,7 @@ run is one configuration, whose seeds are one chunk in one slot.
 """
 
 import dataclasses
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +16,7 @@ from mjx_reinforce.engine.base import Environment
 from mjx_reinforce.engine.memory import host_memory
 from mjx_reinforce.registry import is_own
 from mjx_reinforce.reports.experiment import counted
-from mjx_reinforce.runs.design import Design, configure
+from mjx_reinforce.runs.design import Design
 from mjx_reinforce.settings.config import MAX_COUNT, Config, marked
 from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.defaults import num_cores
@@ -26,7 +26,8 @@ from mjx_reinforce.store.ready import Ready, get_ready, made
 from mjx_reinforce.training import resume
 from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.division import Division, divide_run
-from mjx_reinforce.training.record import Runs
+from mjx_reinforce.training.driver import Runs
+from mjx_reinforce.training.slots import Stopwatch
 from mjx_reinforce.training.state import StateRows, last_actors
 
 
@@ -54,14 +55,14 @@ class Part(NamedTuple):
     group: its configurations
     ready: what their programs are made of
     limit: how many of its runs a chunk may have
-    widths: runs that a compiled program moves at once, the most first
+    width: runs that a compiled program moves at once
     chunks: its runs, in parts of about the same size
     """
 
     group: Group
     ready: Ready
     limit: int
-    widths: tuple[int, ...]
+    width: int
     chunks: list[Runs]
 
 
@@ -73,6 +74,7 @@ class Prepared(NamedTuple):
     division: among which devices the runs are divided
     known: what the first file of its directory says, if it goes on
     found: the checkpoint from which a run goes on, if any
+    clock: counts the time since this was asked for
     """
 
     design: Design
@@ -80,16 +82,12 @@ class Prepared(NamedTuple):
     division: Division
     known: Mapping[str, Any]
     found: Checkpoint | None
+    clock: Stopwatch
 
     @property
     def alone(self) -> bool:
         """Whether it is a run, which is one configuration."""
         return not self.design.over
-
-    @property
-    def engine_seconds(self) -> float:
-        """Wall time that making the engines took."""
-        return sum(part.ready.engine_seconds for part in self.parts)
 
 
 def prepare(
@@ -109,10 +107,11 @@ def prepare(
     Raises:
       ValueError: settings do not fit the environment, or it cannot go on here.
     """
+    clock = Stopwatch()
     if design.resume is not None:
         resume.check_same_program(design.resume, known, provenance())
     if design.over:
-        return _prepare_sweep(design, known)
+        return Prepared(design, *_prepare_sweep(design, known), known, None, clock)
     config, division, found = design.base, divide_run(design.base), None
     ready = get_ready(config, design.default or config, env)
     if config.resume is not None:
@@ -120,8 +119,8 @@ def prepare(
     if config.init_from is not None and found is None:
         last_actors(config, ready.policy)  # refused before anything is compiled
     group, width = Group(config, np.zeros(1, int), {}), division.lanes(config.num_seeds)
-    part = Part(group, ready, config.num_seeds, (width,), split_runs(group, "000", 1))
-    return Prepared(design, [part], division, known, found)
+    part = Part(group, ready, config.num_seeds, width, split_runs(group, "000", 1))
+    return Prepared(design, [part], division, known, found, clock)
 
 
 def _find(config: Config, say: Callable[[str], None]) -> Checkpoint | None:
@@ -142,8 +141,11 @@ def _find(config: Config, say: Callable[[str], None]) -> Checkpoint | None:
     return found
 
 
-def _prepare_sweep(design: Design, known: Mapping[str, Any]) -> Prepared:
-    """Returns what a sweep is made of; ``known`` is its sweep.json, if it goes on."""
+def _prepare_sweep(design: Design, known: Mapping[str, Any]) -> tuple[list[Part], Division]:
+    """Returns the groups of a sweep, and what divides them.
+
+    ``known`` is its sweep.json, if it goes on.
+    """
     # A program for several devices need not round as the one for a single device does.
     division = Division(seeds=1 if design.exact else jax.local_device_count())
     old = known.get("local_devices", division.count)
@@ -152,32 +154,31 @@ def _prepare_sweep(design: Design, known: Mapping[str, Any]) -> Prepared:
             f"{design.resume} was begun on {old} devices, and here are {division.count}; go on "
             "with as many"
         )
-    configs, parts = configure(design.base, design.configurations()), []
-    for number, group in enumerate(make_groups(configs, tuple(design.over), exact=design.exact)):
+    parts = []
+    for number, group in enumerate(make_groups(design)):
         env = envs.make_set(group.config.env, group.config.env_set)
         ready = made(env, group.config, division, tuple(group.settings))
-        part, limit = Part(group, ready, 0, (), []), design.chunk_runs
+        part, limit = Part(group, ready, 0, 0, []), design.chunk_runs
         if known:
             limit = known["chunk_runs"][number]
         elif limit is None:
             limit = max(_capacity(part), division.count)
         limit = limit if known else min(limit, group.num_runs)
-        count, widths = divide(group, limit, division.count, exact=design.exact)
+        count, width = divide(group, limit, division.count, exact=design.exact)
         chunks = split_runs(group, f"{number:03d}", count)
-        parts.append(part._replace(limit=limit, widths=widths, chunks=chunks))
-    return Prepared(design, parts, division, known, None)
+        parts.append(part._replace(limit=limit, width=width, chunks=chunks))
+    return parts, division
 
 
-def make_groups(configs: Sequence[Config], swept: Collection[str], *, exact: bool) -> list[Group]:
+def make_groups(design: Design) -> list[Group]:
     """Returns the configurations of a sweep in groups, in the order of their first members.
 
-    Args:
-      configs: of the sweep.
-      swept: the settings in which they differ.
-      exact: trace every number that may be, so that what is swept beside it changes no program.
+    Where it is exact, every number is traced that may be, so that what is swept beside it changes
+    no program.
     """
     members: dict[Any, list[int]] = {}
-    traced = [_traced(config, swept, exact) for config in configs]
+    configs = design.configs
+    traced = [_traced(config, design.over, design.exact) for config in configs]
     for number, (config, settings) in enumerate(zip(configs, traced, strict=True)):
         compiled = dataclasses.replace(config, **dict.fromkeys(settings, None))
         members.setdefault((dataclasses.astuple(compiled), tuple(settings)), []).append(number)
@@ -216,17 +217,14 @@ def _traced(config: Config, swept: Collection[str], exact: bool) -> dict[str, fl
 #: The states of a chunk take up to this part of the host's memory, with copies of them. So few runs
 #: are one chunk whatever they take: to know that takes a second a group.
 _MEMORY, _COPIES, _FEW = 0.6, 5, 256
-#: Episodes side by side in a slot of a device; the widest slot first. On two CPU cores a run costs
-#: the same beside 7 others or 255, and narrow slots waste less on runs of other lengths. An H200
-#: needs 65,536 episodes for most of its speed; for few runs a narrow slot answers sooner.
-_CPU_EPISODES = (128,)
-_GPU_EPISODES = (65_536, 8_192)
+#: Episodes side by side in a slot of a device. On two CPU cores a run costs the same beside 7
+#: others or 255, and narrow slots waste less on runs of other lengths. An H200 needs 65,536 for
+#: most of its speed.
+_CPU_EPISODES, _GPU_EPISODES = 128, 65_536
 
 
-def divide(
-    group: Group, limit: int, num_devices: int, *, exact: bool
-) -> tuple[int, tuple[int, ...]]:
-    """Returns ``num_chunks`` and ``widths`` of a part.
+def divide(group: Group, limit: int, num_devices: int, *, exact: bool) -> tuple[int, int]:
+    """Returns ``num_chunks`` and the ``width`` of a part.
 
     Args:
       group: whose configurations have ``group.config.num_seeds`` runs each.
@@ -237,11 +235,10 @@ def divide(
     total = group.num_runs
     num_chunks = -(-total // limit)
     if exact:
-        return num_chunks, (num_devices,)
+        return num_chunks, num_devices
     most = -(-total // (num_chunks * num_devices))
     side = _CPU_EPISODES if jax.default_backend() == "cpu" else _GPU_EPISODES
-    each = {min(most, -(-count // group.config.episodes_per_update)) for count in side}
-    return num_chunks, tuple(num_devices * width for width in sorted(each, reverse=True))
+    return num_chunks, num_devices * min(most, -(-side // group.config.episodes_per_update))
 
 
 def split_runs(group: Group, name: str, num_chunks: int) -> list[Runs]:
@@ -279,13 +276,11 @@ def describe(prepared: Prepared) -> str:
     parts, first, ready = prepared.parts, prepared.parts[0].group.config, prepared.parts[0].ready
     what, said = f"{counted(first.num_seeds, 'seed')} of {first.env}", ""
     if not prepared.alone:
-        runs = sum(part.group.num_runs for part in parts)
-        count = counted(prepared.design.count(), "configuration")
-        what = f"{count} of {counted(first.num_seeds, 'seed')}, {runs:,} runs of {first.env}"
-        chunks = [len(runs.seed) for part in parts for runs in part.chunks]
+        runs = [len(runs.seed) for part in parts for runs in part.chunks]
+        what = f"{counted(prepared.design.count(), 'configuration')} of {what}, {sum(runs):,} runs,"
         said = (
-            f"; {counted(len(parts), 'compiled program')}, {counted(len(chunks), 'chunk')} of up "
-            f"to {max(chunks):,} runs"
+            f"; {counted(len(parts), 'compiled program')}, {counted(len(runs), 'chunk')} of up to "
+            f"{max(runs):,} runs"
         )
     return (
         f"Training {what} by {first.algorithm}, {_budget(first)}, on {_where(prepared.division)}, "
@@ -295,22 +290,18 @@ def describe(prepared: Prepared) -> str:
 
 def _budget(config: Config) -> str:
     """Returns for how long each seed is trained."""
-    if config.minutes is not None:
-        budgets = [f"{config.minutes:g} min together"]
-    else:
-        budgets = [f"{config.env_steps:,} env steps each"] if config.env_steps is not None else []
-    if config.max_updates is not None:
-        budgets.append(f"{config.max_updates:,} updates each")
-    return " or ".join(budgets)
+    asked = {"minutes": "min together", "max_updates": "updates each"}
+    if config.minutes is None:
+        asked["env_steps"] = "env steps each"
+    budgets = {unit: getattr(config, name) for name, unit in asked.items()}
+    return " or ".join(f"{x:,} {unit}" for unit, x in budgets.items() if x is not None)
 
 
 def _where(division: Division) -> str:
     """Returns which devices compute, of how many here."""
-    here, count, kind = jax.local_device_count(), division.count, jax.local_devices()[0].device_kind
-    cpu = jax.default_backend() == "cpu"
-    if count == 1:
-        first = f", the first of the {here} here," if here > 1 else ""
-        return counted(num_cores(), "CPU core") if cpu else f"one {kind}{first}"
-    said = f"{count} devices" if count == here else f"{count} of the {here} devices here"
-    what = "seeds" if division.seeds > 1 else "episodes of an update"
-    return f"{said if cpu else f'{said} ({kind} each)'}, which share the {what},"
+    here, kind = jax.local_device_count(), jax.local_devices()[0].device_kind
+    if here == 1:
+        return counted(num_cores(), "CPU core") if kind == "cpu" else f"one {kind}"
+    shared = "seeds" if division.seeds > 1 else "episodes of an update"
+    which = f", which share the {shared}," if division.count > 1 else ""
+    return f"{division.count} of the {here} devices here ({kind}){which}"

@@ -17,13 +17,27 @@ from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.export.run_files import Which
 from mjx_reinforce.files import read_arrays, read_json
 from mjx_reinforce.learning.policy import Actor, Policy
+from mjx_reinforce.runs.command_line import report_on
 from mjx_reinforce.runs.design import Design, check_swept
 from mjx_reinforce.runs.perform import perform
-from mjx_reinforce.runs.run_files import Callbacks
-from mjx_reinforce.runs.sweep_command import report_on
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import worst_if_not_finite
-from mjx_reinforce.training.driver import Driver, Evaluation
+from mjx_reinforce.training.driver import Driver, Evaluation, Observer
+from mjx_reinforce.training.record import Cells
+
+
+class Callbacks(Observer[Driver]):
+    """A user's own functions, called with each ``Evaluation``; one that returns true ends it."""
+
+    def __init__(self, functions: Sequence[Callable[[Evaluation], Any]]):
+        """Takes the functions."""
+        self._functions = functions
+
+    def evaluated(self, driver: Driver, evaluation: Evaluation, rows: Cells) -> None:
+        """Calls the functions."""
+        for function in self._functions:
+            if function(evaluation):
+                driver.ended = True
 
 
 class RunResults(NamedTuple):
@@ -122,19 +136,12 @@ def run(
       >>> results.test_returns.shape, results.summary["status"]
       ((2,), 'finished')
     """
-    check_kind("config", config, Config, 'mjx_reinforce.of_task("Hopper-v5")')
     if not (isinstance(observers, Sequence) and all(map(callable, observers))):
         raise ValueError(
             "observers must be a list of functions of one Evaluation, such as "
             f"[lambda evaluation: print(evaluation.seconds)], got {observers!r}"
         )
-    if config.resume is not None:
-        raise ValueError(
-            f"run() begins a run: go on with {config.resume} by python -m mjx_reinforce.train "
-            f"--resume {config.resume}"
-        )
-    if output is not None:
-        config = dataclasses.replace(config, output=Path(output))
+    config = _beginning("config", config, output)
     outcome = perform(
         Design(base=config),
         Interrupt(),  # that hears nothing: signals are the caller's
@@ -147,7 +154,7 @@ def run(
     history = driver.record.history()
     return RunResults(
         config=driver.config,
-        directory=driver.config.output,
+        directory=outcome.directory,
         eval_return=history["eval_return"],
         env_steps=history["env_steps"],
         training=driver.record.training(),
@@ -230,22 +237,33 @@ def sweep(
       >>> swept.configurations, swept.configuration.tolist()
       ([{'discount': 0.98}, {'discount': 0.99}], [0, 0, 1, 1])
     """
-    check_kind("base", base, Config, 'mjx_reinforce.of_task("Hopper-v5")')
-    if base.resume is not None:
-        raise ValueError(
-            f"sweep() begins a sweep: go on with {base.resume} by python -m mjx_reinforce.sweep "
-            f"--resume {base.resume}"
-        )
+    base = _beginning("base", base, output)
     check_swept(over)
     with contextlib.ExitStack() as held:
-        asked = base.output if output is None else Path(output)
-        place = asked
+        place = asked = base.output
         if place is None:
             place = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="sweep-")))
         base = dataclasses.replace(base, output=place)
         design = Design(base=base, over=over, exact=exact, chunk_runs=chunk_runs)
         report_on(perform(design, Interrupt(), quiet=quiet), report=report and asked is not None)
         return read_results(place)._replace(directory=asked)
+
+
+def _beginning(name: str, config: Config, output: Path | str | None) -> Config:
+    """Returns settings of what begins, with its directory, or raises ValueError.
+
+    Args:
+      name: of the argument.
+      config: that was given.
+      output: its directory, if that was given too.
+    """
+    check_kind(name, config, Config, 'mjx_reinforce.of_task("Hopper-v5")')
+    if (directory := config.resume) is not None:
+        raise ValueError(
+            f"this begins anew: python -m mjx_reinforce.train --resume {directory} goes on with "
+            "what is there"
+        )
+    return config if output is None else dataclasses.replace(config, output=Path(output))
 
 
 def read_results(directory: Path) -> SweepResults:

@@ -3,10 +3,8 @@
 import dataclasses
 import enum
 import functools
-import operator
 import reprlib
 import shlex
-import tomllib
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -115,21 +113,6 @@ def marked(mark: enum.Enum) -> tuple[str, ...]:
     """Returns the names of the settings that are declared with a mark."""
     fields = dataclasses.fields(Config)
     return tuple(field.name for field in fields if mark in field.metadata.get("marks", ()))
-
-
-def read_tables(name: str) -> dict[str, dict[str, Any]]:
-    """Returns the tables of settings in a TOML file of this folder, in which "None" is None.
-
-    A table has the settings of those that it is ``like``, which stand before it, and its own.
-    """
-    text = Path(__file__).with_name(name).read_text("utf-8")
-    read: dict[str, dict[str, Any]] = {}
-    for title, table in tomllib.loads(text).items():
-        of_others = [read[other] for other in table.pop("like", ())]
-        own = {name: tuple(x) if isinstance(x, list) else x for name, x in table.items()}
-        own = {name: None if x == "None" else x for name, x in own.items()}
-        read[title] = functools.reduce(operator.or_, [*of_others, own])
-    return read
 
 
 def check(config: Config) -> None:

@@ -1,20 +1,71 @@
-"""The default settings of each task: what differs from those of ``settings``.
+"""The default settings of each task: what differs from those of ``groups``.
 
 They are filled in before the command line is read, so that a flag always wins, ``--help`` shows
-them, and all that comes later sees plain settings. Presets have their own.
+them, and all that comes later sees plain settings. ``tuned.toml`` has what searches found, by task
+and budget, and ``presets.toml`` published programs under names; each explains its words.
 """
 
 import dataclasses
+import functools
 import importlib.util
 import itertools
+import operator
 import os
+import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from mjx_reinforce.engine.checks import whole_number
-from mjx_reinforce.settings import tables
 from mjx_reinforce.settings.config import CODE, Config, spoken
+
+
+def read_tables(name: str) -> dict[str, dict[str, Any]]:
+    """Returns the tables of settings in a TOML file of this folder, in which "None" is None.
+
+    A table has the settings of those that it is ``like``, which stand before it, and its own.
+    """
+    text = Path(__file__).with_name(name).read_text("utf-8")
+    read: dict[str, dict[str, Any]] = {}
+    for title, table in tomllib.loads(text).items():
+        of_others = [read[other] for other in table.pop("like", ())]
+        own = {name: tuple(x) if isinstance(x, list) else x for name, x in table.items()}
+        own = {name: None if x == "None" else x for name, x in own.items()}
+        read[title] = functools.reduce(operator.or_, [*of_others, own])
+    return read
+
+
+#: name -> (a line for --help, the settings).
+PRESETS: dict[str, tuple[str, Config]] = {
+    name: (table.pop("about"), Config(**table))
+    for name, table in read_tables("presets.toml").items()
+    if "about" in table
+}
+
+#: What a table says beside settings.
+_NO_SETTINGS = ("task", "at_least", "minute")
+_TUNED = read_tables("tuned.toml")
+#: Environment id -> its time limit (env steps).
+HORIZONS: dict[str, int] = _TUNED.pop("horizons")
+_ROWS = [table for table in _TUNED.values() if "task" in table]
+
+
+def _without_facts(row: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in row.items() if name not in _NO_SETTINGS}
+
+
+_SMALLEST = {row["task"]: row for row in _ROWS if "at_least" not in row}
+#: Environment id -> the settings that differ from those of ``groups``.
+OF_TASKS: dict[str, dict[str, Any]] = {task: _without_facts(row) for task, row in _SMALLEST.items()}
+#: Environment id -> from so many env steps of a seed on, what else differs.
+OF_BUDGETS: dict[str, list[tuple[int, dict[str, Any]]]] = {}
+for _row in _ROWS:
+    if "at_least" in _row:
+        OF_BUDGETS.setdefault(_row["task"], []).append((_row["at_least"], _without_facts(_row)))
+#: Environment id -> the env steps of a seed that a default run trains, on a CPU and on a GPU.
+MINUTES: dict[str, tuple[int, int]] = {
+    task: row["minute"] for task, row in _SMALLEST.items() if "minute" in row
+}
 
 #: Where a budget is large, it has about so many evaluations.
 _EVALUATIONS = 50
@@ -49,30 +100,30 @@ def of_task(
       >>> dataclasses.replace(config, num_seeds=8).num_seeds, config.env_steps
       (8, 20000)
     """
-    few = dataclasses.replace(Config(env=env, num_seeds=num_seeds), **tables.OF_TASKS.get(env, {}))
+    few = dataclasses.replace(Config(env=env, num_seeds=num_seeds), **OF_TASKS.get(env, {}))
     config = few
-    known = tables.MINUTES.get(env)
+    known = MINUTES.get(env)
     if env_steps is None and minutes is None and not known:
         return few
-    minute = _PLENTY if env in tables.TASKS else few.env_steps or 0
+    minute = _PLENTY if env in HORIZONS else few.env_steps or 0
     if known:  # two cores share their time among the seeds, where more is to be had
         shared = known[0] * Config.num_seeds // min(max(num_seeds, 1), Config.num_seeds)
         minute = known[1] if has_gpu() else min(shared, max(known))
     time = round(minute * (1 if minutes is None else minutes))
     budget = max(1, time) if env_steps is None else env_steps
-    for least, settings in tables.OF_BUDGETS.get(env, ()):
+    for least, settings in OF_BUDGETS.get(env, ()):
         # On a GPU few episodes take as long as many.
         if budget >= least or (env_steps is None and has_gpu()):
             config = dataclasses.replace(few, **settings)
     config = dataclasses.replace(config, env_steps=budget)
     if isinstance(config.decay_steps, int) and config.decay_steps < budget:
         config = dataclasses.replace(config, decay_steps="budget")
-    if env not in tables.TASKS:
+    if env not in HORIZONS:
         return config
     # In a run so long that an interrupt, which waits for the updates between two evaluations, would
     # wait long, there are a few a minute.
     every = min(budget // _EVALUATIONS, minute // _A_MINUTE)
-    every //= config.episodes_per_update * config.training_horizon(tables.TASKS[env].horizon)
+    every //= config.episodes_per_update * config.training_horizon(HORIZONS[env])
     return dataclasses.replace(config, eval_every=max(config.eval_every, every))
 
 

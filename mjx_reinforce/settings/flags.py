@@ -16,7 +16,7 @@ from mjx_reinforce.console.commands import COMMANDS, command
 from mjx_reinforce.console.streams import accept_everything, say_error
 from mjx_reinforce.engine.checks import nearest, whole_number
 from mjx_reinforce.registry import is_own
-from mjx_reinforce.settings.tables import PRESETS
+from mjx_reinforce.settings.defaults import PRESETS
 
 Form = TypeVar("Form")
 
@@ -51,7 +51,6 @@ def read_command_line(
     arguments: Sequence[str],
     prog: str,
     description: str | None = None,
-    main: Sequence[str] = (),
 ) -> Form:
     """Returns what a command line says; --help exits, and so does what tyro cannot read.
 
@@ -60,24 +59,10 @@ def read_command_line(
       arguments: the flags and their values.
       prog: the name of the program, for --help.
       description: of the program, for --help; the docstring of the form if not given.
-      main: the fields that --help alone shows, where --help all shows all; all if not given.
     """
-    few = main if asks_brief_help(arguments) else ()
     _give_help(form)
-    asked: Any = _few_fields(form, few) if few else form
     options: dict[str, Any] = {"registry": _READERS, "config": (tyro.conf.OmitArgPrefixes,)}
-    try:
-        return tyro.cli(asked, prog=prog, description=description, args=arguments, **options)
-    except SystemExit as stop:
-        if few and not stop.code:
-            print("\n--help all shows all settings.")
-        raise
-
-
-def asks_brief_help(arguments: Sequence[str]) -> bool:
-    """Returns whether a command line asks for --help, and not for --help all."""
-    after = [(*arguments, "")[i + 1] for i, x in enumerate(arguments) if x in ("-h", "--help")]
-    return bool(after) and "all" not in after
+    return tyro.cli(form, prog=prog, description=description, args=arguments, **options)
 
 
 def _give_help(form: type) -> None:
@@ -94,18 +79,6 @@ def _give_help(form: type) -> None:
         elif field.name in said:
             help = " ".join(said[field.name].split())
             field.metadata = MappingProxyType({**field.metadata, "help": help})
-
-
-def _few_fields(form: type, names: Sequence[str]) -> type:
-    """Returns a dataclass with a few fields of the dataclasses in another, for --help."""
-    groups: list[Any] = [field.default for field in dataclasses.fields(form)]
-    every = {f.name: (group, f) for group in groups for f in dataclasses.fields(group)}
-    made = []
-    for name in names:
-        group, field = every[name]
-        own = dataclasses.field(default=getattr(group, name), metadata=field.metadata)
-        made.append((name, field.type, own))
-    return dataclasses.make_dataclass("Few", made, frozen=True, kw_only=True)
 
 
 def about_word(word: str) -> str:

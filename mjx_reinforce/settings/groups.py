@@ -257,7 +257,7 @@ class LogSettings:
     log: tuple[Literal["tensorboard", "wandb"], ...] = setting(
         (), Mark.NOT_COMPILED, once="what it measures is in curves.npz"
     )
-    """Log the interquartile mean, quantiles and first 16 seeds of each column. tensorboard: charts
+    """Log the interquartile mean, ends and first 16 seeds of each column. tensorboard: charts
     in RUN/tensorboard; to see them, pip install tensorboard, then tensorboard --logdir RUN.
     wandb: Weights & Biases (pip install wandb), offline in RUN/wandb; upload with wandb sync, or
     set WANDB_MODE=online during the run."""
@@ -273,10 +273,3 @@ GROUPS = {
     "checkpoints": CheckpointSettings,
     "logs": LogSettings,
 }
-#: The settings that --help alone shows, where they are read: those that most runs change.
-MAIN = (
-    *("env", "env_steps", "minutes", "num_seeds", "output", "resume"),
-    *("estimator", "num_episodes", "learning_rate", "hidden_sizes"),
-)
-#: What it shows too where the default of one setting is not the usual one.
-UNUSUAL = {"train_horizon": ("train_horizon",), "update": ("update", "max_kl")}

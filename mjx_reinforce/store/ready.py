@@ -23,7 +23,6 @@ class Ready(NamedTuple):
     policy: how to rebuild its policy, see ``policy_files.save_policy``
     engine: the name of what plays the episodes
     why: the reason it was chosen, for people
-    engine_seconds: wall time that making it took
     programs: () -> those of the runs, before they are compiled; made when they are first asked for
     """
 
@@ -32,7 +31,6 @@ class Ready(NamedTuple):
     policy: dict[str, Any]
     engine: str
     why: str
-    engine_seconds: float
     programs: Callable[[], Programs]
 
 
@@ -54,7 +52,7 @@ def get_ready(config: Config, default: Config, env: Environment | None = None) -
         ready = made(built, config)
         if key is not None:
             facts = ready._asdict()
-            del facts["programs"], facts["engine_seconds"]
+            del facts["programs"]
             whole = kept.keep(key, facts, ready.programs())
             ready = ready._replace(programs=lambda: whole)
     if config.resume is None and config.policy == "auto":
@@ -75,7 +73,7 @@ def _found(key: str, config: Config) -> Ready | None:
         return None
     facts, programs = found
     programs = programs._replace(division=divide_run(config))
-    return Ready(**facts, engine_seconds=0.0, programs=lambda: programs)
+    return Ready(**facts, programs=lambda: programs)
 
 
 def made(
@@ -126,6 +124,5 @@ def made(
         policy=policy_settings(env, config),
         engine=learner.engine.name,
         why=learner.engine.why,
-        engine_seconds=learner.engine.seconds,
         programs=programs,
     )

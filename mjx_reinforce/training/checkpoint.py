@@ -2,8 +2,7 @@
 
 Each archive is written whole, under a name that ends in the beginning of its SHA-256: a file that
 was cut off or changed is noticed, and the one before it is used. The newest two are kept, and the
-newest one that is even, for runs whose budget is raised. ``SaveDue`` says when one is due, and
-``Attempts`` what is done where a file cannot be written while a run goes on.
+newest one that is even, for runs whose budget is raised.
 """
 
 import contextlib
@@ -11,11 +10,10 @@ import hashlib
 import io
 import json
 import re
-import time
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,7 +34,6 @@ class Checkpoint(NamedTuple):
     metrics_bytes: length of metrics.csv
     env_steps: the budget of a seed, or None
     max_updates: the other budget, or None
-    settings: all settings of the run, as config.json has them; None in a sweep's
     number: its place among the run's checkpoints, once it is saved
     """
 
@@ -48,7 +45,6 @@ class Checkpoint(NamedTuple):
     metrics_bytes: int
     env_steps: int | None
     max_updates: int | None
-    settings: dict[str, Any] | None = None
     number: int = 0
 
     def is_even(self, eval_every: int) -> bool:
@@ -99,14 +95,6 @@ def read_checkpoints(folder: Path, say: Callable[[str], None]) -> Iterator[Check
             say(f"checkpoint {path.name} is damaged; trying the one before")
         else:
             yield _decode(content, path)
-
-
-def settings_of(folder: Path) -> dict[str, Any]:
-    """Returns the settings with which the newest whole checkpoint was written; {} if none has."""
-    for content in filter(None, map(_read, _archives(folder))):
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            return json.loads(str(archive["rest"])).get("settings") or {}
-    return {}
 
 
 def remove_checkpoints(folder: Path, after: int = 0) -> None:
@@ -171,59 +159,3 @@ def _decode(content: bytes, path: Path) -> Checkpoint:
             f"{path} does not fit this version of the program ({error}); "
             "resume with the version that wrote it"
         ) from error
-
-
-#: Between checkpoints, where the user has not said how many updates.
-_CHECKPOINT_SECONDS = 60.0
-
-
-class SaveDue:
-    """When a checkpoint is due: after enough updates, or about a minute after the last one."""
-
-    def __init__(self, checkpoint_every: int | None):
-        """Begins before the first update.
-
-        Args:
-          checkpoint_every: updates between checkpoints; None for about a minute.
-        """
-        self._every = checkpoint_every
-        self.saved(0)
-
-    def saved(self, updates: int) -> None:
-        """Notes that the newest checkpoint has so many updates, also one that was found."""
-        self._at, self._updates = time.perf_counter(), updates
-
-    def is_due(self, updates: int) -> bool:
-        """Returns whether to save after so many updates."""
-        if self._every is None:
-            return time.perf_counter() - self._at >= _CHECKPOINT_SECONDS
-        return updates - self._updates >= self._every
-
-
-class Attempts:
-    """Writes of a run that goes on: one that fails is a warning, and is tried again later."""
-
-    def __init__(self, say: Callable[[str], None]):
-        """Takes what shows a line to the user."""
-        self._say = say
-        self._failing: set[str] = set()
-
-    def attempt(self, what: str, write: Callable[[], None]) -> bool:
-        """Returns whether something could be written; the first failure in a row is shown.
-
-        Args:
-          what: is written, for the warning.
-          write: writes it, or raises OSError.
-        """
-        try:
-            write()
-            self._failing.discard(what)
-            return True
-        except OSError as error:
-            if what not in self._failing:
-                problem = error.strerror or error
-                self._say(
-                    f"warning: cannot write {what} ({problem}); training goes on and tries again"
-                )
-            self._failing.add(what)
-            return False

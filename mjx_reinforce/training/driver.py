@@ -1,7 +1,7 @@
 """Runs as they go on: their programs move them, and observers see what they measure."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -13,7 +13,6 @@ from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.record import Cells, Record, RunRecord
-from mjx_reinforce.training.resume import recordable
 from mjx_reinforce.training.slots import Measured, Slots
 from mjx_reinforce.training.state import Best, StateRows, first_best, keep_best
 
@@ -65,7 +64,7 @@ class Observer(Generic[Seen]):
 
         Args:
           driver: of the runs.
-          met: [S] how many of them met numbers which are not finite, of each seed; none in a sweep.
+          met: [S] how many of the last block met numbers which are not finite, of each seed.
         """
 
     def evaluated(self, driver: Seen, evaluation: Evaluation, rows: Cells) -> None:
@@ -83,33 +82,6 @@ class Observer(Generic[Seen]):
 _SECONDS = 0.25
 
 
-def drive(
-    slots: Slots, record: Record, interrupted: Callable[[], bool], most: int = 1
-) -> Iterator[list[Measured]]:
-    """Moves runs on until they are over; yields what was measured, for the record to take in.
-
-    Policies are evaluated with the updates that follow, and the last ones alone. A block that was
-    interrupted is not evaluated, which may take minutes: the resumed runs do that.
-
-    Args:
-      slots: the runs.
-      record: of what they measure. It takes in what is yielded before the next is asked for.
-      interrupted: whether the end is to be soon.
-      most: so many blocks of updates may be made at once, where they take no time.
-    """
-    blocks = 1
-    while not interrupted():
-        if record.over():
-            if not record.is_evaluated():
-                yield [slots.evaluate()]
-            return
-        began = time.perf_counter()
-        measured = slots.advance(*record.moved(), look=not record.is_evaluated(), most=blocks)
-        yield measured
-        enough = len(measured) * _SECONDS / (time.perf_counter() - began)
-        blocks = max(1, min(int(enough), 2 * len(measured), most))
-
-
 def check_layout(found: Checkpoint, slots: Slots) -> None:
     """Raises ValueError for a checkpoint of another program."""
     if found.layout != slots.layout.layout:
@@ -119,30 +91,53 @@ def check_layout(found: Checkpoint, slots: Slots) -> None:
         )
 
 
+class Runs(NamedTuple):
+    """Runs of a sweep that move on together; those of a run are its seeds.
+
+    name: of these, for their files
+    place: [R] the configuration of each run, counted within its group
+    configuration: [R] the same, counted in the sweep
+    seed: [R]
+    """
+
+    name: str
+    place: np.ndarray
+    configuration: np.ndarray
+    seed: np.ndarray
+
+
 class Training:
     """Runs as they go on, such as a part of a sweep's.
 
     config: the settings; one of those that differ from run to run stands for any value
     slots: what moves the runs
     record: what they have measured
+    runs: which they are
     observers: who sees them, in this order
     ended: whether an observer asked for the end
     """
 
     def __init__(
-        self, config: Config, slots: Slots, record: Record, observers: Sequence[Observer[Any]] = ()
+        self,
+        config: Config,
+        slots: Slots,
+        record: Record,
+        runs: Runs,
+        observers: Sequence[Observer[Any]] = (),
     ):
         """Begins before the first update, where the slots are."""
-        self.config, self.slots, self.record = config, slots, record
+        self.config, self.slots, self.record, self.runs = config, slots, record, runs
         self.observers, self.ended = list(observers), False
         self._began = time.perf_counter()
+        #: Wall time at which the present policies were there (s).
+        self._reached = 0.0
 
     def restore(self, found: Checkpoint) -> None:
         """Goes back to a checkpoint, or raises ValueError if it is another program's."""
         check_layout(found, self.slots)
         self.slots.restore(found.states)
         self.record.restore(found.record)
-        self._began = time.perf_counter() - found.seconds
+        self._began, self._reached = time.perf_counter() - found.seconds, found.seconds
 
     def checkpoint(self) -> Checkpoint:
         """Returns what ``restore`` takes."""
@@ -169,27 +164,45 @@ class Training:
     def drive(self, interrupted: Callable[[], bool]) -> None:
         """Trains until the budget is used, nothing is finite, or someone asks for the end.
 
+        Policies are evaluated with the updates that follow, and the last ones alone. A block that
+        was interrupted is not evaluated, which may take minutes: the resumed runs do that.
+
         Args:
           interrupted: whether the runs are to end soon.
         """
-        for blocks in drive(
-            self.slots, self.record, lambda: self.ended or interrupted(), self._most()
-        ):
-            self._take(blocks)
+        blocks, most = 1, self._most()
+        while not (self.ended or interrupted()):
+            look = not self.record.is_evaluated()
+            if self.record.over():
+                if look:
+                    self._take([self.slots.evaluate()])
+                break
+            began = time.perf_counter()
+            measured = self.slots.advance(*self.record.moved(), look=look, most=blocks)
+            enough = len(measured) * _SECONDS / (time.perf_counter() - began)
+            blocks = max(1, min(int(enough), 2 * len(measured), most))
+            self._take(measured)
 
     def _most(self) -> int:
         """Returns how many blocks of updates may be made before anyone looks."""
         return (self.config.checkpoint_every or MAX_COUNT) // self.config.eval_every
 
     def _take(self, blocks: list[Measured]) -> None:
-        """Takes in evaluations and the updates after them."""
-        self.record.add(blocks, self.seconds())
+        """Takes in evaluations and the updates that followed them."""
+        met = np.zeros(0, int)
+        for block in blocks:
+            if block.looked:
+                self._take_evaluation(block)
+            if block.metrics:
+                met = self.record.add_updates(block)
         if blocks[0].metrics:
-            self._updated(np.zeros(0, int))
+            self._reached = self.seconds()
+            for observer in self.observers:
+                observer.updated(self, met)
 
-    def _updated(self, met: np.ndarray) -> None:
-        for observer in self.observers:
-            observer.updated(self, met)
+    def _take_evaluation(self, measured: Measured) -> None:
+        """Takes in what the policies before a block return."""
+        self.record.add_evaluation(measured, self._reached)
 
 
 class Driver(Training):
@@ -202,30 +215,20 @@ class Driver(Training):
 
     record: RunRecord
 
-    def __init__(
-        self,
-        config: Config,
-        slots: Slots,
-        record: RunRecord,
-        observers: Sequence[Observer[Any]] = (),
-    ):
+    def __init__(self, *given: Any):
         """Begins before the first update, where the slots are."""
-        super().__init__(config, slots, record, observers)
-        self.states = slots.states()
+        super().__init__(*given)
+        self.states = self._before = self.slots.states()
         self.best = first_best(self.states.train_states)
-        #: Wall time at which the present policies were there (s).
-        self._reached = 0.0
 
     def restore(self, found: Checkpoint) -> None:
         """Goes back to a checkpoint, which has the best policies too."""
         super().restore(found)
         self.states, self.best = self.slots.states(), StateRows(self.best).states(found.best)
-        self._reached = found.seconds
 
     def checkpoint(self) -> Checkpoint:
         """Returns what ``restore`` takes."""
-        whole, settings = super().checkpoint(), recordable(self.config)
-        return whole._replace(best=StateRows(self.best).rows(self.best), settings=settings)
+        return super().checkpoint()._replace(best=StateRows(self.best).rows(self.best))
 
     def drive(self, interrupted: Callable[[], bool]) -> None:
         """Trains as any runs; what was made before an observer's end is evaluated."""
@@ -237,28 +240,21 @@ class Driver(Training):
         return 1
 
     def _take(self, blocks: list[Measured]) -> None:
-        """Takes in an evaluation and the updates that followed it."""
-        [measured] = blocks
-        before, self.states = self.states.train_states, self.slots.states()
-        if measured.looked:
-            self._take_evaluation(before, measured.looked)
-        if measured.metrics:
-            met = self.record.add_updates(measured.metrics)
-            self._reached = self.seconds()
-            self._updated(met)
+        self._before, self.states = self.states, self.slots.states()
+        super()._take(blocks)
 
-    def _take_evaluation(self, evaluated: TrainState, measured: Arrays) -> None:
-        """Takes in what the policies of these states return, and keeps the best."""
-        actor, num_updates = evaluated.actor, evaluated.num_updates
-        returns = measured["eval_return"]
-        present = Best(actor=actor, eval_return=returns, num_updates=num_updates)
+    def _take_evaluation(self, measured: Measured) -> None:
+        """Takes in what the policies before a block return, and keeps the best."""
+        before, looked = self._before.train_states, measured.looked
+        actor, num_updates = before.actor, before.num_updates
+        present = Best(actor=actor, eval_return=looked["eval_return"], num_updates=num_updates)
         self.best = keep_best(self.best, present)
         rows = self.record.add_evaluation(measured, self._reached)
         evaluation = Evaluation(
             updates=counts.to_int(num_updates),
-            env_steps=self.record.env_steps,
+            env_steps=self.record.env_steps.copy(),
             seconds=self._reached,
-            measured=measured,
+            measured=looked,
             actor=actor,
             train_states=self.states.train_states,
         )

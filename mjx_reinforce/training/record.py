@@ -1,9 +1,11 @@
 """What a run has measured so far, and what follows from it.
 
-Blocks of training metrics and evaluations come in; rows of metrics.csv, curves, and the
-summary come out. Nothing here prints, writes a file, or reads a clock.
+Blocks of training metrics and evaluations come in; rows of metrics.csv, curves, how far it is, and
+the summary come out. Updates may meet numbers that are not finite: which ones, and when a seed is
+past hope. Nothing here prints, writes a file, or reads a clock.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -11,9 +13,7 @@ import numpy as np
 
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.statistics import summarize
-from mjx_reinforce.training import progress
-from mjx_reinforce.training.progress import BLOCKS, Progress, measure_progress, used
+from mjx_reinforce.statistics import iqm, summarize
 
 if TYPE_CHECKING:
     from mjx_reinforce.training.slots import Measured
@@ -28,48 +28,22 @@ COLUMNS = (
     *("kl", "policy_std", "explained_variance", "gradient_snr", "clipped_gradients"),
 )
 HEADER = (",".join(COLUMNS) + "\n").encode()
-#: Columns that an evaluation measures.
-_EVALUATION = ("eval_return", "eval_return_stochastic", "eval_length")
-#: Columns that the last update measured, and the names of its metrics: the same, but for two.
+#: What these columns are called among the metrics of an update.
 _RENAMED = {"train_return": "episode_return", "train_length": "episode_length"}
-_LAST_UPDATE = _RENAMED | {name: name for name in COLUMNS[COLUMNS.index("entropy") :]}
 
 
-def of_evaluation(
-    evaluation: dict[str, np.ndarray],
-    last_update: dict[str, np.ndarray],
-    updates: np.ndarray,
-    episodes: np.ndarray,
-    env_steps: np.ndarray,
-    seconds: float,
-    first_seed: int = 0,
-) -> Cells:
-    """Returns the cells of all seeds; a return is NaN if one of its episodes was not finite.
+def as_cells(measured: Arrays, seconds: float) -> Cells:
+    """Returns the cells of all seeds.
 
     Args:
-      evaluation: [S] each, what ``block.evaluate`` returns.
-      last_update: [S] each, the metrics of each seed's last update; empty before the first. The
-        columns of metrics that a learner does not have are empty.
-      updates: [S] how many were made.
-      episodes: [S] how many were played for them.
-      env_steps: [S] and how many env steps.
+      measured: [S] each, by column, or as ``_RENAMED``. What was not measured is empty. A return is
+        NaN if one of its episodes was not finite.
       seconds: wall time since compilation ended.
-      first_seed: the number of the first seed.
     """
-    num_seeds = len(updates)
-    columns: dict[str, Sequence[str]] = {
-        "seed": _cells(first_seed + np.arange(num_seeds)),
-        "update": _cells(updates),
-        "episodes": _cells(episodes),
-        "env_steps": _cells(env_steps),
-        "wall_seconds": [f"{seconds:.3f}"] * num_seeds,
-    }
-    for name in _EVALUATION:
-        columns[name] = _cells(evaluation[name])
-    for name, metric in _LAST_UPDATE.items():
-        measured = last_update.get(metric)
-        columns[name] = [""] * num_seeds if measured is None else _cells(measured)
-    return {name: columns[name] for name in COLUMNS}
+    known = {name: measured.get(_RENAMED.get(name, name)) for name in COLUMNS}
+    empty = [""] * len(measured["seed"])
+    cells = {name: empty if x is None else _cells(x) for name, x in known.items()}
+    return cells | {"wall_seconds": [f"{seconds:.3f}"] * len(empty)}
 
 
 def lines(rows: Cells) -> bytes:
@@ -85,6 +59,137 @@ def _cells(values: np.ndarray) -> Sequence[str]:
     # all digits of a double, 1 ms.
     texts = ("%.9g\n" * len(values) % tuple(values.tolist())).split()
     return [f"{text}.0" if text.lstrip("-").isdigit() else text for text in texts]
+
+
+#: The time left is estimated from so many of the latest blocks: episodes change their length.
+BLOCKS = 10
+
+
+def used(config: Config, env_steps: np.ndarray, updates: np.ndarray) -> np.ndarray:
+    """Returns the fraction of its budget that each seed has used, of counts [..., S]."""
+    fraction = np.zeros(env_steps.shape)
+    if config.env_steps is not None:
+        fraction = env_steps / config.env_steps
+    if config.max_updates is not None:
+        fraction = np.maximum(fraction, updates / config.max_updates)
+    return fraction
+
+
+class Progress(NamedTuple):
+    """How far a run is, as of its last evaluation.
+
+    fraction: how much of their budgets the seeds have used, in the mean
+    updates: made by the seed that made the most
+    env_steps: of the mean seed
+    iqm: interquartile mean of the return over seeds, NaN where failed seeds reach the middle half
+    worst: the return of the worst seed, NaN if one failed
+    failed: how many seeds have a return that is not finite
+    num_seeds: of how many
+    env_steps_per_second: of all seeds together, the mean since the start
+    seconds_left: estimated from the latest blocks, NaN before the first
+    """
+
+    fraction: float
+    updates: int
+    env_steps: float
+    iqm: float
+    worst: float
+    failed: int
+    num_seeds: int
+    env_steps_per_second: float
+    seconds_left: float
+
+
+def measure_progress(past: dict[str, np.ndarray], used: np.ndarray) -> Progress:
+    """Returns how far a run is.
+
+    Args:
+      past: its last E evaluations, at most ``BLOCKS`` + 1: ``eval_return``, ``env_steps`` and
+        ``updates`` [E, S], and ``seconds`` [E] since compilation ended.
+      used: [E, S] the fraction of its budget that each seed had used.
+    """
+    returns, seconds = past["eval_return"][-1], past["seconds"]
+    fractions, passed = np.minimum(used, 1.0).mean(axis=-1), seconds[-1] - seconds[0]
+    total, fraction = past["env_steps"][-1].sum(), float(fractions[-1])
+    progressed = fraction - float(fractions[0])
+    return Progress(
+        fraction=fraction,
+        updates=int(past["updates"][-1].max()),
+        env_steps=float(past["env_steps"][-1].mean()),
+        iqm=float(iqm(returns)),
+        worst=float(returns.min()),
+        failed=int(np.sum(~np.isfinite(returns))),
+        num_seeds=len(returns),
+        env_steps_per_second=float(total / seconds[-1]) if seconds[-1] > 0 else math.nan,
+        seconds_left=float((1 - fraction) * passed / progressed) if progressed > 0 else math.nan,
+    )
+
+
+#: Why a run that is ``hopeless`` is stopped.
+HOPELESS = (
+    "every seed that still trained was broken throughout the last updates, its episodes "
+    "or its new policy not finite; lower --learning-rate (ars: --step-size) or mend the task"
+)
+#: A run is not given up before each of its seeds was broken so many updates in a row: blocks may
+#: be shorter, and a seed may recover from one such update, since the next draws other numbers.
+_FEWEST = 5
+#: A message names so many seeds.
+_NAMED = 5
+
+
+def nonfinite_updates(metrics: Arrays) -> np.ndarray:
+    """Returns how many updates of a block met numbers which are not finite, of each seed [S].
+
+    Args:
+      metrics: [K, S] each, as for ``Record.add``.
+    """
+    broken = (metrics["nonfinite_episodes"] > 0) | (metrics["skipped_update"] > 0)
+    return (broken & metrics["active"]).sum(axis=0)
+
+
+def broken_in_a_row(before: np.ndarray, metrics: Arrays) -> np.ndarray:
+    """Returns how many of its latest updates each seed was broken in, without one between.
+
+    An update is broken if all its episodes left the finite numbers, or if it was skipped.
+
+    Args:
+      before: [S] the same before this block.
+      metrics: [K, S] each, as for ``Record.add``.
+    """
+    broken = metrics["nonfinite_episodes"] >= metrics["episodes"]
+    broken |= metrics["skipped_update"] > 0
+    count = before
+    for active_now, broken_now in zip(metrics["active"], broken, strict=True):
+        count = np.where(active_now, np.where(broken_now, count + 1, 0), count)
+    return count
+
+
+def hopeless(in_a_row: np.ndarray, used: np.ndarray, block: int) -> bool:
+    """Returns whether every seed that still trains was broken throughout a block of updates.
+
+    Args:
+      in_a_row: [S] from ``broken_in_a_row``.
+      used: [S] the fraction of its budget that each seed has used.
+      block: updates in a block; fewer than five count as five.
+    """
+    training = used < 1.0
+    return bool(training.any() and np.all(in_a_row[training] >= max(block, _FEWEST)))
+
+
+def describe_nonfinite(met: np.ndarray, first_seed: int, updates: int) -> str:
+    """Returns one line about ``nonfinite_updates`` of which at least one is not 0.
+
+    Args:
+      met: [S] how many of a block, of each seed.
+      first_seed: the number of the first seed.
+      updates: how many there were after the block.
+    """
+    seeds = (first_seed + np.flatnonzero(met)).tolist()
+    named = ", ".join(map(str, seeds[:_NAMED])) + (", ..." if len(seeds) > _NAMED else "")
+    return (
+        f"up to update {updates}: {len(seeds):,} of {len(met):,} seeds met numbers that are not "
+        f"finite or beyond 1e10 ({named}), in {met.sum():,} updates"
+    )
 
 
 class GrowingTable:
@@ -129,29 +234,30 @@ def _of_group(arrays: Mapping[str, np.ndarray], group: str) -> Arrays:
 
 
 class Record:
-    """What R runs have measured so far, such as the seeds of one run.
+    """What R runs have measured so far, such as a part of a sweep's.
 
     updates: [R] int64, how many each has made
     env_steps: [R] int64, how many each has played in training
     nonfinite: [R] int64, how many of its updates met numbers that are not finite
-    seconds: wall time from the end of compilation to what was measured last
+    lengths: [R] int64, of a sweep, the steps of all episodes of each run's latest evaluation
+    seconds: wall time from the end of compilation to the policies that were evaluated last
     """
 
     #: What a checkpoint has besides the tables.
-    _kept: tuple[str, ...] = ("updates", "env_steps", "nonfinite", "seconds")
+    _kept: tuple[str, ...] = ("updates", "env_steps", "nonfinite", "lengths", "seconds")
 
     def __init__(self, config: Config):
         """Begins before the first update; R is ``config.num_seeds``."""
         self.config = config
-        self.updates = np.zeros(config.num_seeds, np.int64)
-        self.env_steps = np.zeros(config.num_seeds, np.int64)
-        self.nonfinite = np.zeros(config.num_seeds, np.int64)
+        self.updates, self.env_steps, self.nonfinite, self.lengths = (
+            np.zeros(config.num_seeds, np.int64) for _ in range(4)
+        )
         self.seconds = 0.0
         self._tables = {"evaluations": GrowingTable({})}
 
     def arrays(self) -> Arrays:
         """Returns all that was measured, by name, for ``restore``."""
-        arrays = {name: np.asarray(getattr(self, name)) for name in self._kept}
+        arrays = {name: np.array(getattr(self, name)) for name in self._kept}
         for group, table in self._tables.items():
             arrays |= {f"{group}.{name}": values for name, values in table.columns().items()}
         return arrays
@@ -164,7 +270,7 @@ class Record:
         """
         for name in self._kept:
             value = arrays[name]
-            setattr(self, name, value if value.ndim else value.item())
+            setattr(self, name, value.copy() if value.ndim else value.item())
         for group in self._tables:
             self._tables[group] = GrowingTable(_of_group(arrays, group))
 
@@ -193,112 +299,60 @@ class Record:
         """Returns whether no run is to go on, and the last policies are evaluated."""
         return self.over() and self.is_evaluated()
 
-    def add(self, blocks: Sequence["Measured"], seconds: float) -> None:
-        """Takes in evaluations and the updates after them.
+    def add_evaluation(self, measured: "Measured", seconds: float) -> Cells:
+        """Takes in an evaluation of the present policies.
 
         Args:
-          blocks: one after the other; runs that made no update in it stay as they are.
-          seconds: wall time since the beginning.
-        """
-        raise NotImplementedError
+          measured: in it; runs that made no update after it repeat their last evaluation.
+          seconds: wall time since compilation ended, at which the policies were there.
 
-    def progress(self) -> Progress:
-        """Returns how far the runs are."""
-        raise NotImplementedError
+        Returns:
+          The cells of its rows in metrics.csv, which a sweep has not.
+        """
+        runs, metrics, looked = measured
+        made = np.any(metrics["active"], axis=0) if metrics else np.ones(len(runs), bool)
+        runs, returns = runs[made], np.zeros(len(self.updates), np.float32)
+        env_steps = np.zeros_like(self.env_steps)
+        if last := self._tables["evaluations"].latest(1):
+            returns, env_steps = last["eval_return"][0].copy(), last["env_steps"][0].copy()
+        returns[runs], env_steps[runs] = looked["eval_return"][made], self.env_steps[runs]
+        self.lengths[runs] = looked["eval_steps"][made]
+        self._append(seconds, eval_return=returns, env_steps=env_steps, updates=self.updates)
+        return {}
+
+    def _append(self, seconds: float, **row: np.ndarray) -> None:
+        """Adds the row [R] of an evaluation."""
+        self.seconds = seconds
+        row["seconds"] = np.asarray(seconds, np.float64)
+        self._tables["evaluations"].append({name: x[None].copy() for name, x in row.items()})
+
+    def add_updates(self, measured: "Measured") -> np.ndarray:
+        """Takes in a block of updates; returns what ``nonfinite_updates`` does."""
+        runs, metrics, _ = measured
+        active, met = metrics["active"], nonfinite_updates(metrics)
+        self.updates[runs] += active.sum(axis=0)
+        steps = np.where(active, metrics["env_steps"], 0)
+        self.env_steps[runs] += steps.sum(axis=0, dtype=np.int64)
+        self.nonfinite[runs] += met
+        return met
 
     def moved(self) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Returns which runs [R] move on, and about how long their episodes are [R].
-
-        None stands for all: a seed of a run whose budget is used is still evaluated.
-        """
-        return None, None
-
-
-class Runs(NamedTuple):
-    """Runs of a sweep that move on together.
-
-    name: of these, for their files
-    place: [R] the configuration of each run, counted within its group
-    configuration: [R] the same, counted in the sweep
-    seed: [R]
-    """
-
-    name: str
-    place: np.ndarray
-    configuration: np.ndarray
-    seed: np.ndarray
-
-
-class ChunkRecord(Record):
-    """What the R runs of a chunk of a sweep have measured.
-
-    runs: which they are
-    lengths: [R] the steps of all episodes of each run's latest evaluation
-    """
-
-    _kept = (*Record._kept, "lengths")
-
-    def __init__(self, config: Config, runs: Runs):
-        """Begins before the first update; R is ``config.num_seeds``."""
-        super().__init__(config)
-        self.runs = runs
-        self.lengths = np.zeros(config.num_seeds, np.int64)
-        self._before = self.env_steps, self.seconds
-
-    def add(self, blocks: Sequence["Measured"], seconds: float) -> None:
-        """Takes in what was measured; of runs that made no update in a block, nothing."""
-        self._before, self.seconds = (self.env_steps.copy(), self.seconds), seconds
-        for runs, metrics, looked in blocks:
-            made = np.any(metrics["active"], axis=0) if metrics else np.ones(len(runs), bool)
-            self._add_evaluation(runs[made], {name: x[made] for name, x in looked.items()})
-            if metrics:
-                self._add_updates(runs, metrics)
-
-    def _add_evaluation(self, runs: np.ndarray, looked: Arrays) -> None:
-        latest = self.latest()
-        latest["eval_return"][runs] = looked["eval_return"]
-        latest["env_steps"][runs] = self.env_steps[runs]
-        self.lengths[runs] = looked["eval_steps"]
-        self._tables["evaluations"].append({name: x[None] for name, x in latest.items()})
-
-    def _add_updates(self, runs: np.ndarray, metrics: Arrays) -> None:
-        self.updates[runs] += metrics["active"].sum(axis=0)
-        steps = np.where(metrics["active"], metrics["env_steps"], 0)
-        self.env_steps[runs] += steps.sum(axis=0, dtype=np.int64)
-        self.nonfinite[runs] += progress.nonfinite_updates(metrics)
-
-    def latest(self) -> Arrays:
-        """Returns ``eval_return`` of each run's latest evaluation, and ``env_steps`` until then."""
-        if not self.begun():
-            num_runs = len(self.updates)
-            return {
-                "eval_return": np.zeros(num_runs, np.float32),
-                "env_steps": np.zeros(num_runs, np.int64),
-            }
-        return {name: x[0].copy() for name, x in self._tables["evaluations"].latest(1).items()}
-
-    def curves(self) -> Arrays:
-        """Returns ``eval_return``, and ``env_steps`` until then, [E, R] each."""
-        return self._tables["evaluations"].columns()
-
-    def moved(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns which runs [R] have not used their budget, and how long their episodes are."""
         return self.used() < 1.0, self.lengths
 
-    def share(self) -> float:
-        """Returns the part of the budgets of all runs that is used."""
-        return float(np.minimum(self.used(), 1.0).mean())
-
     def progress(self) -> Progress:
-        """Returns how far the runs are; its fraction is ``share``."""
-        steps, seconds = self._before
-        past = {
-            "eval_return": self.latest()["eval_return"][None],
-            "env_steps": np.stack([steps, self.env_steps]),
-            "updates": self.updates[None],
-            "seconds": np.array([seconds, self.seconds]),
-        }
-        return measure_progress(past, np.array([self.share()] * 2))
+        """Returns how far the runs are, as of their last evaluation."""
+        names = ("eval_return", "env_steps", "updates", "seconds")
+        past = self._tables["evaluations"].latest(BLOCKS + 1, *names)
+        return measure_progress(past, used(self.config, past["env_steps"], past["updates"]))
+
+    def history(self) -> Arrays:
+        """Returns what the evaluations measured, [E, R] each.
+
+        That is ``eval_return``, the ``env_steps`` until then and, of a run, ``episodes``.
+        """
+        past = self._tables["evaluations"].columns()
+        return {n: past[n] for n in ("eval_return", "env_steps", "episodes") if n in past}
 
 
 class RunRecord(Record):
@@ -306,7 +360,7 @@ class RunRecord(Record):
 
     episodes: [S] int64, how many each seed has played in training
     simulated, evaluated: steps that were simulated, and those of evaluations
-    broken_in_a_row: [S] see ``progress.broken_in_a_row``
+    broken_in_a_row: [S] see ``broken_in_a_row``
     threshold: the return that counts as solved, if any
     """
 
@@ -338,39 +392,37 @@ class RunRecord(Record):
         super().restore(arrays)
         self._last = _of_group(arrays, "last")
 
-    def add_updates(self, metrics: Arrays) -> np.ndarray:
+    def moved(self) -> tuple[None, None]:
+        """Returns None for all: a seed whose budget is used is still evaluated."""
+        return None, None
+
+    def add_updates(self, measured: "Measured") -> np.ndarray:
         """Takes in a block of updates.
 
         A training return is NaN if one of its episodes left the finite numbers.
 
         Args:
-          metrics: [K, S] each, of K updates: those of ``Learner.step`` and of
-            ``block_of_updates``.
+          measured: the metrics are those of ``Learner.step`` and of ``block_of_updates``.
 
         Returns:
-          What ``progress.nonfinite_updates`` does.
+          What ``nonfinite_updates`` does.
         """
-        active, played = metrics["active"], metrics["episodes"]
-        finite = metrics["nonfinite_episodes"] == 0
-        env_steps = self.env_steps + np.cumsum(metrics["env_steps"], axis=0, dtype=np.int64)
-        updates = self.updates + np.cumsum(active, axis=0, dtype=np.int64)
-        episodes = self.episodes + np.cumsum(active * played, axis=0, dtype=np.int64)
-        made = active.any(axis=1)
+        metrics = measured.metrics
+        active, finite = metrics["active"], metrics["nonfinite_episodes"] == 0
         returns = np.where(finite, metrics["episode_return"], np.nan)
+        played, steps = active * metrics["episodes"], metrics["env_steps"]
         training = {
             "episode_return": np.where(active, returns, np.nan),
-            "env_steps": env_steps,
-            "episodes": episodes,
+            "env_steps": self.env_steps + np.cumsum(steps, axis=0, dtype=np.int64),
+            "episodes": self.episodes + np.cumsum(played, axis=0, dtype=np.int64),
         }
+        made = active.any(axis=1)
         self._tables["training"].append({name: x[made] for name, x in training.items()})
-        self.env_steps, self.updates = env_steps[-1], updates[-1]
-        self.episodes = episodes[-1]
+        self.episodes = training["episodes"][-1]
         self.simulated += _sum(metrics["simulated_steps"])
-        self.broken_in_a_row = progress.broken_in_a_row(self.broken_in_a_row, metrics)
-        met = progress.nonfinite_updates(metrics)
-        self.nonfinite = self.nonfinite + met
+        self.broken_in_a_row = broken_in_a_row(self.broken_in_a_row, metrics)
         self._remember(metrics | {"episode_return": returns})
-        return met
+        return super().add_updates(measured)
 
     def _remember(self, metrics: Arrays) -> None:
         """Keeps each seed's metrics of its last update; a seed that stands still makes none."""
@@ -380,33 +432,27 @@ class RunRecord(Record):
             newest = np.take_along_axis(values, last[None], axis=0)[0]
             self._last[name] = np.asarray(np.where(made > 0, newest, self._last.get(name, newest)))
 
-    def add_evaluation(self, result: Arrays, seconds: float) -> Cells:
-        """Takes in an evaluation [S] of the present policies.
+    def add_evaluation(self, measured: "Measured", seconds: float) -> Cells:
+        """Takes in an evaluation [S] of the present policies of all seeds.
 
         Args:
-          result: what ``block.evaluate`` returns, for each seed.
+          measured: in it.
           seconds: wall time since compilation ended.
 
         Returns:
-          The cells of its rows in metrics.csv, see ``of_evaluation``.
+          The cells of its rows in metrics.csv.
         """
-        counts = {"env_steps": self.env_steps, "episodes": self.episodes, "updates": self.updates}
-        row = result | counts | {"seconds": np.asarray(seconds, np.float64)}
-        self._tables["evaluations"].append({name: x[None] for name, x in row.items()})
-        self._count(result)
-        self.seconds = seconds
-        return of_evaluation(
-            *(result, self._last, self.updates, self.episodes, self.env_steps, seconds),
-            first_seed=self.config.first_seed,
-        )
+        looked, seeds = measured.looked, self.config.first_seed + np.arange(len(self.updates))
+        counts = {"env_steps": self.env_steps, "episodes": self.episodes}
+        self._append(seconds, **looked, **counts, updates=self.updates)
+        self.add_test(looked)
+        counts |= {"seed": seeds, "update": self.updates}
+        return as_cells(self._last | looked | counts, seconds)
 
-    def add_test(self, result: Arrays) -> None:
-        """Counts what a test of final policies simulated, of ``block.evaluate``."""
-        self._count(result)
-
-    def _count(self, result: Arrays) -> None:
-        self.simulated += _sum(result["simulated_steps"])
-        self.evaluated += _sum(result["eval_steps"])
+    def add_test(self, looked: Arrays) -> None:
+        """Counts what an evaluation or a test simulated, of ``block.evaluate``."""
+        self.simulated += _sum(looked["simulated_steps"])
+        self.evaluated += _sum(looked["eval_steps"])
 
     def over(self) -> bool:
         """Returns whether the budget is used, or nothing is finite any more."""
@@ -414,19 +460,7 @@ class RunRecord(Record):
 
     def hopeless(self) -> bool:
         """Returns whether all seeds that still train were broken throughout a block of updates."""
-        return progress.hopeless(self.broken_in_a_row, self.used(), self.config.eval_every)
-
-    def progress(self) -> Progress:
-        """Returns how far the run is, as of its last evaluation."""
-        names = ("eval_return", "env_steps", "updates", "seconds")
-        past = self._tables["evaluations"].latest(BLOCKS + 1, *names)
-        fractions = used(self.config, past["env_steps"], past["updates"]).min(axis=-1)
-        return measure_progress(past, fractions)
-
-    def history(self) -> Arrays:
-        """Returns ``eval_return``, and ``env_steps`` and ``episodes`` until then, [E, S] each."""
-        past = self._tables["evaluations"].columns()
-        return {name: past[name] for name in ("eval_return", "env_steps", "episodes")}
+        return hopeless(self.broken_in_a_row, self.used(), self.config.eval_every)
 
     def training(self) -> Arrays:
         """Returns ``episode_return`` and the ``env_steps`` and ``episodes`` after it, [U, S].

@@ -2,10 +2,9 @@
 
 import dataclasses
 import json
-import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from mjx_reinforce.engine.checks import fits
 from mjx_reinforce.files import read_json
@@ -27,73 +26,43 @@ _PROGRAM = (
 #: Entries that no number depends on.
 _BESIDE = ("python", "num_devices", "cpu_count", "resumed")
 _DEVICES = "--xla_force_host_platform_device_count"
-#: Settings that files of version 0.1 lack; there the default held.
-_LATER = ("env_set", "seeds")
 _OTHER = "damaged, or of another version of the program; resume with the version that wrote it"
 
 
-#: The first file of what can go on -> what that is, and the command that goes on with it.
-_BEGUN = {"config.json": ("run", "train"), "sweep.json": ("sweep", "sweep")}
+#: The first file of a run, and that of a sweep.
+_BEGUN = ("config.json", "sweep.json")
 
 
-def read_record(directory: Path, name: str = "config.json") -> dict[str, Any]:
+def read_record(directory: Path) -> dict[str, Any]:
     """Returns what the first file of a run or a sweep says.
 
     Raises:
       ValueError: it is not there, or it is damaged.
     """
-    path = directory / name
-    try:
-        return read_json(path)
-    except ValueError as error:
-        if not isinstance(error.__cause__, FileNotFoundError):
-            raise
-        for other, (kind, command) in _BEGUN.items():
-            if (directory / other).is_file():
-                raise ValueError(
-                    f"{directory} is a {kind}: python -m mjx_reinforce.{command} --resume "
-                    f"{directory} goes on with it"
-                ) from error
-        raise ValueError(
-            f"cannot resume {directory}: there is no {path}, so nothing was begun there; start it "
-            "anew with --output"
-        ) from error
-
-
-def read_settings(directory: Path) -> Config:
-    """Returns the settings of a run, for going on with it in its directory.
-
-    Raises:
-      ValueError: there is no such run, or its config.json is damaged or of another version.
-    """
-    recorded = read_record(directory)
-    return dataclasses.replace(as_config(recorded, directory / "config.json"), resume=directory)
+    for name in _BEGUN:
+        try:
+            return read_json(directory / name)
+        except ValueError as error:
+            if not isinstance(error.__cause__, FileNotFoundError):
+                raise
+    raise ValueError(
+        f"cannot resume {directory}: there is no {' or '.join(_BEGUN)}, so nothing was begun "
+        "there; start it anew with --output"
+    )
 
 
 def as_config(recorded: Mapping[str, Any], path: Path) -> Config:
     """Returns the settings that a file recorded, or raises ValueError, which names the file."""
-    settings, names = {}, {field.name for field in dataclasses.fields(Config)}
-    if gone := sorted(recorded.keys() - names - {*_PROGRAM, *_BESIDE}):
-        raise ValueError(f"{path} says {gone[0]}, which is no setting: it is {_OTHER}")
-    for field in dataclasses.fields(Config):
-        if field.name in PLACES:
-            continue
-        if field.name not in recorded and field.name in _LATER:
-            continue
-        if field.name not in recorded:
-            raise ValueError(f"{path} does not say {field.name}: it is {_OTHER}")
-        value = recorded[field.name]
-        value = tuple(value) if isinstance(value, list) else value
-        if not fits(value, field.type):
-            says = f"{path} says {field.name} is {value!r}"
-            raise ValueError(f"{says}{_choices(field.type)}: it is {_OTHER}")
-        settings[field.name] = value
+    kinds = {f.name: f.type for f in dataclasses.fields(Config) if f.name not in PLACES}
+    if odd := sorted((recorded.keys() - {*_PROGRAM, *_BESIDE, *PLACES}) ^ kinds.keys()):
+        raise ValueError(f"{path} has other settings ({odd[0]}): it is {_OTHER}")
+    settings: dict[str, Any] = {}
+    for name, kind in kinds.items():
+        value = recorded[name]
+        settings[name] = tuple(value) if isinstance(value, list) else value
+        if not fits(settings[name], kind):
+            raise ValueError(f"{path} says {name} is {value!r}: it is {_OTHER}")
     return Config(**settings)
-
-
-def _choices(hint: object) -> str:
-    names = typing.get_args(hint) if typing.get_origin(hint) is Literal else ()
-    return f", not one of {', '.join(names)}" if names else ""
 
 
 def recordable(config: Config) -> dict[str, Any]:
@@ -180,13 +149,11 @@ def newest_checkpoint(config: Config, say: Callable[[str], None]) -> "Checkpoint
       say: shows a line about each file that does not serve.
 
     Raises:
-      ValueError: the budget is smaller than what the run did, config.json was changed by hand, or
-        a checkpoint is of another version.
+      ValueError: the budget is smaller than what the run did, or a checkpoint is another version's.
     """
     from mjx_reinforce.training import checkpoint
 
     assert config.resume is not None
-    _check_unchanged(config, checkpoint.settings_of(config.resume / "checkpoint"))
     metrics = config.resume / "metrics.csv"
     length = metrics.stat().st_size if metrics.exists() else 0
     for found in checkpoint.read_checkpoints(config.resume / "checkpoint", say):
@@ -195,22 +162,6 @@ def newest_checkpoint(config: Config, say: Callable[[str], None]) -> "Checkpoint
         elif _serves(found, config):
             return found
     return None
-
-
-def _check_unchanged(config: Config, trained: Mapping[str, Any]) -> None:
-    """Raises ValueError if config.json was changed by hand since a checkpoint was written.
-
-    Args:
-      config: what config.json says now, except the budget.
-      trained: the settings in the checkpoint.
-    """
-    said = recordable(config)
-    for name, value in trained.items():
-        if name not in BUDGETS and said.get(name) != value:
-            raise ValueError(
-                f"{config.resume}/config.json says that {name} is {said.get(name)}, but the run "
-                f"was trained with {value}; put that back, or start another run"
-            )
 
 
 def _serves(found: "Checkpoint", config: Config) -> bool:

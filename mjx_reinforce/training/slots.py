@@ -22,26 +22,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.engine.devices import NONE, RUNS, SECOND, executable
+from mjx_reinforce.engine.memory import gigabytes, host_memory
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import num_cores
-from mjx_reinforce.training.memory import check_fits, check_room
 from mjx_reinforce.training.programs import Programs
 from mjx_reinforce.training.state import Budget, RunState, StateRows, budget_of, shape_of_all
 
 
-def pack_slots(
-    chosen: np.ndarray, lengths: np.ndarray, widths: Sequence[int], num_devices: int
-) -> np.ndarray:
+def pack_slots(chosen: np.ndarray, lengths: np.ndarray, width: int, num_devices: int) -> np.ndarray:
     """Returns the runs of each slot.
 
     Args:
       chosen: [R] which runs are packed, at least one.
       lengths: [R] about how long their episodes are; runs of equal lengths share a slot.
-      widths: that slots may have, multiples of the number of devices, the most first. The first of
-        which these runs fill more than a quarter of a slot is taken, or else the last: on an H200
-        the wider slot takes as long as two of an eighth of its width.
+      width: of a slot, a multiple of the number of devices.
       num_devices: among which a slot is divided; each gets as many runs as the others, or one less.
 
     Returns:
@@ -49,7 +45,6 @@ def pack_slots(
     """
     runs = np.flatnonzero(chosen)
     runs = runs[np.argsort(lengths[runs], kind="stable")]
-    width = next((width for width in widths if len(runs) > width // 4), widths[-1])
     lanes = np.full((-(-len(runs) // width), width), -1)
     lanes.flat[: len(runs)] = runs
     dealt = lanes.reshape(len(lanes), width // num_devices, num_devices)
@@ -60,12 +55,16 @@ def pack_slots(
 class Stopwatch:
     """Where the time goes (s).
 
+    began: when
     compiling: with nothing trained beside it
-    running: training and evaluating
     """
 
+    began: float = dataclasses.field(default_factory=time.perf_counter)
     compiling: float = 0.0
-    running: float = 0.0
+
+    def running(self) -> float:
+        """Returns the rest of the time: training and evaluating."""
+        return time.perf_counter() - self.began - self.compiling
 
     def wait(self, compiled: Future) -> Any:
         """Returns a program, once it is compiled."""
@@ -109,21 +108,21 @@ class Slot(NamedTuple):
 
 
 class Compiled(NamedTuple):
-    """Programs that are compiled for slots of some widths.
+    """Programs that are compiled for slots.
 
     begin: (seed, the numbers [W] of the runs' seeds, settings [W] each) -> the first states [W, B],
-      and the data of the keys [K, W] of the last test, where W is the greatest width
-    slots: by their width, the widest first; the narrower ones may still be compiling
+      and the data of the keys [K, W] of the last test
+    slot: what moves the runs of a slot
+    width: W, the runs of a slot
     programs: that were compiled
     config: the settings of the runs; one of those that differ stands for any value
-    clock: counts the time that passes until a narrower slot's are there
     """
 
     begin: Callable[..., tuple[jax.Array, jax.Array]]
-    slots: dict[int, "Future[Slot]"]
+    slot: Slot
+    width: int
     programs: Programs
     config: Config
-    clock: Stopwatch
 
 
 class Slots:
@@ -147,7 +146,7 @@ class Slots:
         self._compiled, self._rides = compiled, compiled.programs.rides
         self._division, self.layout = compiled.programs.division, StateRows(compiled.programs.like)
         self.budget = budget_of(compiled.config)
-        width, count = max(compiled.slots), len(numbers)
+        width, count = compiled.width, len(numbers)
         kind = jnp.result_type(float)
         given = {name: x.astype(kind) for name, x in (settings or {}).items()}
         seed = self._division.put(np.uint32(compiled.config.seed), NONE)
@@ -190,14 +189,14 @@ class Slots:
           chosen: [R] which of them, at least one; all by default.
           lengths: [R] about how long their episodes are, see ``pack_slots``.
           look: whether to evaluate before the first block.
-          most: how many blocks, where one of the narrowest slots holds these runs. Else they are
-            packed again after one.
+          most: how many blocks, where a slot holds these runs. Else they are packed again after
+            one.
 
         Returns:
           What was measured in each block in which a run made an update.
         """
-        lanes, programs = self._pack(chosen, lengths)
-        count = most if lanes.shape == (1, min(self._compiled.slots)) else 1
+        lanes, programs = self._pack(chosen, lengths), self._compiled.slot
+        count = most if len(lanes) == 1 else 1
         budget = self._division.put(tuple(self.budget), NONE)
 
         def move(runs: np.ndarray) -> Any:
@@ -225,7 +224,7 @@ class Slots:
 
     def evaluate(self) -> Measured:
         """Evaluates the present policies of all runs."""
-        lanes, programs = self._pack()
+        lanes, programs = self._pack(), self._compiled.slot
 
         def look(runs: np.ndarray) -> Any:
             which = self._division.put(runs >= 0)
@@ -258,13 +257,12 @@ class Slots:
 
     def _pack(
         self, chosen: np.ndarray | None = None, lengths: np.ndarray | None = None
-    ) -> tuple[np.ndarray, Slot]:
-        """Returns the runs of each slot, and what moves them."""
-        slots, num_runs = self._compiled.slots, len(self._rows)
+    ) -> np.ndarray:
+        """Returns the runs of each slot."""
+        num_runs = len(self._rows)
         chosen = np.ones(num_runs, bool) if chosen is None else chosen
         lengths = np.zeros(num_runs) if lengths is None else lengths
-        lanes = pack_slots(chosen, lengths, list(slots), self._division.seeds)
-        return lanes, self._compiled.clock.wait(slots[lanes.shape[1]])
+        return pack_slots(chosen, lengths, self._compiled.width, self._division.seeds)
 
 
 def _side_by_side(move: Callable[[np.ndarray], Any], lanes: np.ndarray) -> list[Any]:
@@ -293,45 +291,25 @@ def _of_slots(lanes: np.ndarray, slots: Sequence[tuple[Arrays, Arrays]]) -> Meas
     return Measured(runs[order], metrics, looked)
 
 
-def compile_slots(
-    programs: Programs,
-    config: Config,
-    widths: Sequence[int],
-    clock: Stopwatch | None = None,
-) -> Compiled:
-    """Compiles programs for the widest slot, and begins with the narrower ones.
-
-    These are traced while the widest are compiled: a sweep of some seconds soon needs them.
+def compile_slots(programs: Programs, config: Config, width: int) -> Compiled:
+    """Compiles programs for slots.
 
     Args:
       programs: of the runs.
       config: see ``Compiled``.
-      widths: how many runs a slot may have, the most first; multiples of the devices that have
-        runs of their own.
-      clock: see ``Compiled``.
+      width: how many runs a slot has; a multiple of the devices that have runs of their own.
 
     Raises:
-      ValueError: the widest slot does not fit into memory.
+      ValueError: a slot does not fit into memory.
     """
-    layout = StateRows(programs.like)
-    begin = started(functools.partial(_compile_begin, programs, widths[0]))
-    widest = started(_trace_slot(programs, layout, widths[0]))
-    slots = {widths[0]: widest}
-    for width in widths[1:]:
-        slots[width] = started(lambda width=width: _trace_slot(programs, layout, width)())
-    widest.result()
-    return Compiled(begin.result(), slots, programs, config, clock or Stopwatch())
+    begin = started(functools.partial(_compile_begin, programs, width))
+    slot = _compile_slot(programs, StateRows(programs.like), width)
+    return Compiled(begin.result(), slot, width, programs, config)
 
 
 def compile_run(programs: Programs, config: Config) -> Slots:
-    """Returns the seeds of a run before the first update, in one slot.
-
-    Args:
-      programs: of the run.
-      config: its settings.
-    """
-    widths = [programs.division.lanes(config.num_seeds)]
-    compiled = compile_slots(programs, config, widths)
+    """Returns the seeds of a run before the first update, in one slot."""
+    compiled = compile_slots(programs, config, programs.division.lanes(config.num_seeds))
     return Slots(compiled, config.first_seed + np.arange(config.num_seeds))
 
 
@@ -345,8 +323,8 @@ def _compile_begin(programs: Programs, width: int) -> Callable[..., Any]:
     return executable(program.lower(seed, *given))
 
 
-def _trace_slot(programs: Programs, layout: StateRows, width: int) -> Callable[[], Slot]:
-    """Traces what moves slots of ``width`` runs; returns what waits until it is compiled."""
+def _compile_slot(programs: Programs, layout: StateRows, width: int) -> Slot:
+    """Compiles what moves slots of ``width`` runs."""
     division = programs.division
     check_room(2.0 * width * layout.size)
     rows, which = division.put((np.zeros((width, layout.size), np.uint8), np.zeros(width, bool)))
@@ -357,13 +335,34 @@ def _trace_slot(programs: Programs, layout: StateRows, width: int) -> Callable[[
     evaluating = started(functools.partial(executable, looking))
     updating = division.jit(programs.advance, *specs, by_episodes=True).lower(*given)
     advancing = started(functools.partial(executable, updating))
+    slot = Slot(advancing.result(), evaluating.result())
+    check_fits(slot.advance)
+    check_fits(slot.evaluate)
+    # No run: a GPU's driver translates the kernels of a program when it first runs.
+    jax.block_until_ready(slot.advance(*given))
+    return slot
 
-    def wait() -> Slot:
-        slot = Slot(advancing.result(), evaluating.result())
-        check_fits(slot.advance)
-        check_fits(slot.evaluate)
-        # No run: a GPU's driver translates the kernels of a program when it first runs.
-        jax.block_until_ready(slot.advance(*given))
-        return slot
 
-    return wait
+def memory_here() -> float:
+    """Returns the memory that a device has for arrays (bytes); on a CPU it is the host's."""
+    device = jax.local_devices()[0]
+    if device.platform == "cpu":
+        return host_memory()
+    return float((device.memory_stats() or {}).get("bytes_limit", float("inf")))
+
+
+def check_room(needed: float) -> None:
+    """Raises ValueError if so many bytes are not there."""
+    if needed > (here := memory_here()):
+        raise ValueError(
+            f"this does not fit into memory: it needs about {gigabytes(needed)}, "
+            f"{gigabytes(here)} are here; lower --num-seeds (of a sweep --chunk-runs), "
+            "--num-episodes, --eval-episodes, --hidden-sizes or --horizon"
+        )
+
+
+def check_fits(program: jax.stages.Compiled) -> None:
+    """Raises ValueError if a program's arrays need more memory than there is."""
+    if (found := program.memory_analysis()) is not None:
+        arrays = found.argument_size_in_bytes + found.output_size_in_bytes
+        check_room(arrays + found.temp_size_in_bytes - found.alias_size_in_bytes)

@@ -16,7 +16,7 @@ from mjx_reinforce.engine.base import PyTree, plain, with_keys
 from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.learning.policy import Actor
-from mjx_reinforce.settings.config import MAX_COUNT, Config, flag
+from mjx_reinforce.settings.config import MAX_COUNT, Config
 
 #: A root of randomness; traced inside of programs.
 Seed = int | np.uint32 | jax.Array
@@ -221,18 +221,12 @@ def last_actors(config: Config, policy: Mapping[str, Any]) -> Actor:
     directory = Path(config.init_from)
     run = read_run(directory)
     saved = read_policy(policy_folder(run, "last"), own=config.policy)
-    settings = {field.name for field in dataclasses.fields(Config)}
-    for name in sorted(policy, key=lambda name: name in settings):  # what no flag sets goes first
-        value, old = policy[name], saved.settings.get(name, policy[name])
-        if name not in settings and old != value:
-            raise ValueError(
-                f"the policies in {directory} are for {run.env}, with {name} {old}, and "
-                f"{config.env} has {value}; leave --init-from out, or give a run of {config.env}"
-            )
+    for name, value in policy.items():
+        old = saved.settings.get(name, value)
         if name not in _DRAWN and old != value:
             raise ValueError(
-                f"the policies in {directory} have {name} {old}, and this run {value}; give "
-                f"{flag(name)} that value, or leave --init-from out"
+                f"the policies in {directory}, trained on {run.env}, have {name} {old}, and this "
+                f"run {value}; make them agree, or leave --init-from out"
             )
     seeds = (config.first_seed + np.arange(config.num_seeds)) % saved.num_seeds
     return jax.tree.map(lambda x: x[seeds], saved.actor)

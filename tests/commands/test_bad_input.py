@@ -40,8 +40,8 @@ from mjx_reinforce.settings.config import (
     marked,
 )
 from mjx_reinforce.settings.declare import Mark
+from mjx_reinforce.settings.defaults import PRESETS
 from mjx_reinforce.settings.groups import Reader
-from mjx_reinforce.settings.tables import PRESETS
 from mjx_reinforce.store.build import build
 
 # Settings that make no sense.
@@ -281,26 +281,27 @@ def test_what_cannot_be_registered_is_refused():
 AS_A_USER = ["setpriv", "--bounding-set=-dac_override,-dac_read_search"] * (os.geteuid() == 0)
 #: Runs each line of its input as a command of the package; prints the statuses and errors.
 COMMANDS = """
-import importlib, sys
+import sys
+from mjx_reinforce import registry
+from mjx_reinforce.console.commands import COMMANDS
 for line in sys.stdin:
-    module, *sys.argv = line.split("#")[0].split()
-    sys.argv.insert(0, module)
+    sys.argv = line.split("#")[0].split()
     try:
-        importlib.import_module(f"mjx_reinforce.{module}").main()
+        registry.load_definition(COMMANDS[sys.argv[0]][0])()
     except SystemExit as stop:
         print(stop.code, file=sys.stderr)
 """
 UNREACHABLE = {
     "train --output closed/run": "cannot write to the run directory closed/run (Permission",
-    "train --output circle": "directory circle (Too many levels of symbolic links)",
+    "train --output circle": "directory circle (File exists)",
     "train --output circle/run": "directory circle/run (Too many levels of symbolic links)",
-    "runs.sweep_command --over discount 1 0.9 --output closed/run": "closed/run (Permission",
+    "sweep --over discount 1 0.9 --output closed/run": "closed/run (Permission",
     "train --resume closed/run": "closed/run/config.json (Permission denied)",
-    "runs.sweep_command --resume closed/run": "closed/run/sweep.json (Permission denied)",
+    "sweep --resume closed/run": "closed/run/config.json (Permission denied)",
     "watch closed/run": "Permission denied",
     "report closed/run": "Permission denied",
-    "export.__main__ closed/run": "Permission denied",
-    "export.__main__ run --output closed/run.npz": "closed",
+    "export closed/run": "Permission denied",
+    "export run --output closed/run.npz": "closed",
     "watch run --output closed/run.gif": "closed",
     "report run --output closed/run.html": "closed",
     "report run --output circle/run.html": "circle",
@@ -381,7 +382,7 @@ def test_no_default_is_refused():
 
 
 def test_text_is_not_read_as_markup(capsys):
-    """Neither in lines nor in tables; ``print_summary`` uses the display's console."""
+    """Neither in lines nor in tables; ``show_summary`` uses the same console."""
     shown, text = display.Display(), "t/[bold]x[/b]:smile:[link=x]y"
     shown.say(text)
     shown.say(text, style="yellow")

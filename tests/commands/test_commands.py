@@ -16,8 +16,8 @@ from mjx_reinforce.engine import checks
 from mjx_reinforce.engine.checks import whole_number
 from mjx_reinforce.envs.__main__ import main as envs_main
 from mjx_reinforce.runs.command_line import parse
-from mjx_reinforce.settings.defaults import of_task
-from mjx_reinforce.settings.groups import MAIN
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.defaults import PRESETS, of_task
 from mjx_reinforce.watch import choose_run
 
 
@@ -92,28 +92,11 @@ def test_a_sweep_records_what_was_typed(monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["train", "sweep"])
-def test_help_has_few_settings_and_help_all_the_rest(call, name):
-    brief, whole = call(name, "--help")[1], call(name, "--help", "all")[1]
-    shown, every = (re.findall(r"(?m)^[|│ ] (--[a-z][a-z-]+)", page) for page in (brief, whole))
-    assert 5 < len(shown) <= 10
-    if name == "train":
-        assert shown == [f"--{name.replace('_', '-')}" for name in MAIN]
-    assert set(shown) < set(every)
-    assert "--help all shows all settings" in brief
-
-
-@pytest.mark.parametrize(
-    ("words", "more", "fewer"),
-    [
-        ("--env HumanoidStandup-v5", "update max-kl train-horizon", "learning-rate"),
-        ("--env HalfCheetah-v5", "train-horizon", "update"),
-    ],
-)
-def test_help_shows_what_makes_the_task(call, words, more, fewer):
-    """A setting that another has taken the place of is not shown."""
-    shown = re.findall(r"(?m)^[|│ ] --([a-z][a-z-]+)", call("train", *words.split(), "--help")[1])
-    assert set(more.split()) <= set(shown)
-    assert not set(fewer.split()) & set(shown)
+def test_help_has_every_setting_and_the_presets(call, name):
+    page = call(name, "--help")[1]
+    shown = re.findall(r"(?m)^[|│ ] (--[a-z][a-z-]+)", page)
+    assert {f"--{name.replace('_', '-')}" for name in vars(Config())} <= set(shown)
+    assert all(preset in page for preset in PRESETS)
 
 
 # Numbers.
@@ -147,7 +130,6 @@ def test_a_task_is_described(monkeypatch, capsys):
         "at most 1,000 env steps, of 0.04 s each",
         "at a return of 950",
         "mjx_reinforce.train --env InvertedPendulum-v5\n",
-        "  --max-kl 0.01\n",
         "--minutes M sets a time",
     ):
         assert text in said, text

@@ -11,7 +11,7 @@ from saved_runs import change, change_arrays, make_run, write
 from mjx_reinforce import load, report, watch
 from mjx_reinforce import train as train_module
 from mjx_reinforce.export import __main__ as export
-from mjx_reinforce.runs import sweep_command
+from mjx_reinforce.runs import command_line
 from mjx_reinforce.runs.design import Design, as_record
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.resume import recordable
@@ -19,7 +19,7 @@ from mjx_reinforce.training.resume import recordable
 ENV = "evil_module:Task"
 MAINS = {
     "train": train_module.main,
-    "sweep": sweep_command.main,
+    "sweep": command_line.sweep,
     "watch": watch.main,
     "report": report.main,
     "export": export.main,

@@ -11,7 +11,7 @@ import pytest
 from toys import Survive
 
 import mjx_reinforce as m
-from mjx_reinforce.settings.tables import PRESETS
+from mjx_reinforce.settings.defaults import PRESETS
 
 ENV = Survive()
 NORMAL = m.normal(ENV.action_space)

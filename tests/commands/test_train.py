@@ -158,14 +158,6 @@ def test_what_is_full_is_said_in_one_line(failing, tmp_path, capsys, error, stat
     assert not (tmp_path / "out").exists()
 
 
-def test_memory_in_pieces_is_named(failing, monkeypatch, capsys):
-    for taken, advised in {"false": True, "true": False, "": False}.items():
-        monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", taken)
-        assert failing(MEMORY) == 2
-        said = capsys.readouterr().err
-        assert ("unset XLA_PYTHON_CLIENT_PREALLOCATE" in said) == advised
-
-
 def test_another_error_is_not_said_to_be_of_memory(failing):
     with pytest.raises(RuntimeError, match="INTERNAL"):
         failing(RuntimeError("INTERNAL"))

@@ -21,9 +21,8 @@ from mjx_reinforce.engine.play import objects
 from mjx_reinforce.envs.outcomes import check_outcome, check_start
 from mjx_reinforce.envs.settings import EpisodeSettings, read_settings
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.settings.tables import TASKS
+from mjx_reinforce.settings.defaults import HORIZONS
 from mjx_reinforce.store import kept
-from mjx_reinforce.training import resume
 
 IDS = envs.names()
 #: Arguments of Gymnasium's tasks that are about pictures.
@@ -92,10 +91,7 @@ def test_sizes_bounds_and_limits(ids):
             assert space.low.shape == space.high.shape == (env.action_size,), id
             assert np.all(space.low < space.high), id
         assert min(env.max_episode_steps, env.dt) > 0, id
-        entries = 1 if isinstance(space, Discrete) else env.action_size
-        sizes = (env.observation_size, entries, env.max_episode_steps)
-        if task := TASKS.get(id):
-            assert (task.observation, task.action, task.horizon) == sizes, id
+        assert HORIZONS.get(id, env.max_episode_steps) == env.max_episode_steps, id
 
 
 @all_in_turn
@@ -314,12 +310,6 @@ def test_programs_of_a_model_of_the_user_s_are_not_kept(monkeypatch, tmp_path):
     assert len(set(keys)) == 2
 
 
-def test_older_settings_have_none(tmp_path):
-    recorded = resume.recordable(Config())
-    del recorded["env_set"]
-    assert resume.as_config(recorded, tmp_path) == Config()
-
-
 QUICK = (
     *("--env", "CartPole-v1", "--engine", "vmap", "--hidden-sizes", "4", "--num-seeds", "2"),
     *("--num-episodes", "2", "--eval-episodes", "2", "--max-updates", "2", "--env-steps", "None"),
@@ -344,7 +334,7 @@ def test_a_run_keeps_the_settings_of_its_environment(tmp_path, monkeypatch, caps
         raise ValueError("enough")
 
     monkeypatch.setattr(watch.envs, "make_set", stop)
-    assert run_command("run", command=watch) == 2
+    assert run_command("run", command=watch.main) == 2
     assert made == [("CartPole-v1", words)]
     capsys.readouterr()
     assert run_command("--resume", "run", "--env-set", "max_episode_steps=8") == 2

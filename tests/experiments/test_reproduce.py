@@ -15,7 +15,7 @@ from experiments.studies.reproduce.statistics import compare, rank_test, reached
 from mjx_reinforce import reinforce
 from mjx_reinforce.learning.estimators import reward_to_go
 from mjx_reinforce.settings.config import check
-from mjx_reinforce.settings.tables import PRESETS
+from mjx_reinforce.settings.defaults import PRESETS
 
 RECORD = {"every_updates": 50, "window_updates": 50, "seeds": {"1": [1.0, 2.0, 3.0], "2": [5.0]}}
 

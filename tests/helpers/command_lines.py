@@ -22,11 +22,10 @@ def added_environments():
         yield register
 
 
-def run_command(*arguments, command=train):
-    """Runs the command line of a module; returns the exit code."""
+def run_command(*arguments, command=train.main):
+    """Runs a command line; returns the exit code."""
     with pytest.MonkeyPatch.context() as patch:
-        name = command.__name__.rpartition(".")[2]
-        patch.setattr(sys, "argv", [name, *map(str, arguments)])
+        patch.setattr(sys, "argv", [command.__name__, *map(str, arguments)])
         with pytest.raises(SystemExit) as stop:
-            command.main()
+            command()
     return stop.value.code

@@ -7,7 +7,7 @@ import pytest
 from toys import Drifting, Survive
 
 from mjx_reinforce import Box, Discrete
-from mjx_reinforce.runs import about_task
+from mjx_reinforce.envs import __main__ as about_task
 from mjx_reinforce.settings.config import Config
 
 
@@ -64,7 +64,7 @@ def test_a_page_has_sizes_rules_settings_and_how_to_train(register):
     config = Config()
     assert train == f"To train {config.num_seeds} seeds for {config.env_steps:,} env steps each:"
     assert command.endswith(" --env Told-v0")
-    assert time == "--minutes M sets a time in place of a number of env steps."
+    assert time.startswith("--minutes M sets a time in place of a number of env steps; --help")
 
 
 def test_what_a_task_does_not_say(register):
@@ -86,13 +86,3 @@ def test_what_a_task_does_not_say(register):
 )
 def test_actions_in_words(space, words):
     assert about_task._action_in_words(Drifting(space)) == words
-
-
-def test_settings_that_differ_are_flags():
-    """Except those that a sentence of their own says, and those that nothing reads."""
-    config = Config(env="Told-v0", learning_rate=0.5, num_seeds=3, env_steps=7, discount=0.5)
-    *_, said = about_task._how_to_train(config)
-    first, *flags = said.splitlines()
-    assert first == "Its default settings, where other tasks have others:"
-    assert flags == ["  --discount 0.5", "  --learning-rate 0.5"]
-    assert about_task._how_to_train(Config(env="Told-v0"))[-1].startswith("--minutes")

@@ -1,14 +1,13 @@
-"""What the runs of a chunk have measured so far."""
+"""What the runs of a part of a sweep have measured so far."""
 
 import numpy as np
 import pytest
 
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training.record import ChunkRecord, Runs
+from mjx_reinforce.training.record import Record
 from mjx_reinforce.training.slots import Measured
 
 CONFIG = Config(num_seeds=4, env_steps=100, max_updates=10)
-RUNS = Runs("000-0000", np.zeros(4, int), np.zeros(4, int), np.arange(4))
 
 
 def measured(runs, returns, lengths, active=(), env_steps=(), broken=()):
@@ -19,23 +18,30 @@ def measured(runs, returns, lengths, active=(), env_steps=(), broken=()):
     return Measured(np.array(runs), metrics if len(active) else {}, looked)
 
 
+def add(record, measured, seconds):
+    record.add_evaluation(measured, seconds)
+    if measured.metrics:
+        record.add_updates(measured)
+
+
 def filled():
-    record = ChunkRecord(CONFIG, RUNS)
-    record.add([measured([2, 0, 1, 3], [3.0, 1, 2, 4], [30, 10, 20, 40])], 0.5)
+    record = Record(CONFIG)
+    add(record, measured([2, 0, 1, 3], [3.0, 1, 2, 4], [30, 10, 20, 40]), 0.5)
     one = measured([3, 1], [7, 8], [5, 6], [[1, 1], [1, 1]], [[70, 20], [60, 30]], [[1, 0], [0, 0]])
     # In the second block the budget of run 3 is used.
     other = measured([3, 1], [0, 9], [0, 7], [[0, 1], [0, 1]], [[0, 5], [0, 5]], [[0, 1], [9, 1]])
-    record.add([one, other], 1.5)
+    add(record, one, 1.5)
+    add(record, other, 2.5)
     return record
 
 
 def test_runs_that_make_no_update_repeat_their_last():
     record = filled()
-    assert record.curves()["eval_return"].tolist() == [[1, 2, 3, 4], [1, 8, 3, 7], [1, 9, 3, 7]]
-    assert record.curves()["env_steps"].tolist() == [[0] * 4, [0] * 4, [0, 50, 0, 0]]
+    assert record.history()["eval_return"].tolist() == [[1, 2, 3, 4], [1, 8, 3, 7], [1, 9, 3, 7]]
+    assert record.history()["env_steps"].tolist() == [[0] * 4, [0] * 4, [0, 50, 0, 0]]
     assert not record.is_evaluated()
-    record.add([measured([0, 1, 2, 3], [5, 6, 7, 8], [1, 2, 3, 4])], 2.0)
-    assert record.curves()["env_steps"][-1].tolist() == [0, 60, 0, 130]
+    add(record, measured([0, 1, 2, 3], [5, 6, 7, 8], [1, 2, 3, 4]), 3.0)
+    assert record.history()["env_steps"][-1].tolist() == [0, 60, 0, 130]
     assert record.is_evaluated()
 
 
@@ -48,21 +54,21 @@ def test_measurements_add_up():
     assert record.updates.tolist() == [0, 4, 0, 2]
 
 
-def test_the_share_is_the_mean_of_all_budgets():
-    now = filled().progress()
-    assert now.fraction == pytest.approx((0.6 + 1.0) / 4)
-    assert (now.updates, now.env_steps, now.num_seeds) == (4, 190 / 4, 4)
+def test_progress_is_as_of_the_last_evaluations():
+    record = filled()
+    now = record.progress()
+    assert record.used().tolist() == pytest.approx([0, 0.6, 0, 1.3])
+    assert (now.updates, now.env_steps, now.num_seeds) == (2, 50 / 4, 4)
     assert now.worst == 1
-    assert now.latest_per_second == 190
-    assert now.env_steps_per_second == pytest.approx(190 / 1.5)
+    assert now.env_steps_per_second == pytest.approx(50 / 2.5)
 
 
 def test_a_record_is_restored():
-    record, copy = filled(), ChunkRecord(CONFIG, RUNS)
+    record, copy = filled(), Record(CONFIG)
     assert not copy.is_evaluated()
     copy.restore({name: x.copy() for name, x in record.arrays().items()})
     for each in (record, copy):
-        each.add([measured([0], [5], [3], [[1]], [[99]], [[0]])], 2.0)
+        add(each, measured([0], [5], [3], [[1]], [[99]], [[0]]), 3.0)
     one, other = record.arrays(), copy.arrays()
     assert one.keys() == other.keys()
     assert all(np.array_equal(one[name], other[name]) for name in one)

@@ -11,7 +11,7 @@ FLAGS = ["--env", "CartPole-v1", "--over", "learning-rate", "0.1", "0.2", "--dis
 
 
 def test_flags_make_a_design():
-    design = command_line.parse_sweep([*FLAGS, "--exact", "--chunk-runs", "4"])
+    design = command_line.parse([*FLAGS, "--exact", "--chunk-runs", "4"], "sweep")
     assert list(design.over["learning_rate"]) == [0.1, 0.2]
     assert (design.base.env, design.base.discount) == ("CartPole-v1", 0.5)
     assert (design.exact, design.chunk_runs, design.resume) == (True, 4, None)
@@ -21,30 +21,26 @@ def test_flags_make_a_design():
 @pytest.fixture
 def resumed(monkeypatch, tmp_path):
     """Parses flags beside --resume; the directory has the sweep of ``FLAGS``."""
-    design = dataclasses.replace(command_line.parse_sweep(FLAGS), default=None)
+    design = dataclasses.replace(command_line.parse(FLAGS, "sweep"), default=None)
     base = dataclasses.replace(design.base, resume=tmp_path)
     design = dataclasses.replace(design, base=base)
     monkeypatch.setattr(command_line, "read_design", lambda directory: design)
     monkeypatch.setattr(command_line, "check_named", lambda *given: None)
 
-    def parse(*flags) -> tuple[Design, Design]:
-        return design, command_line.parse_sweep([*flags, "--resume", str(tmp_path)])
+    def parse(*flags, name="sweep") -> tuple[Design, Design]:
+        return design, command_line.parse([*flags, "--resume", str(tmp_path)], name)
 
     return parse
 
 
 def test_a_sweep_goes_on_as_it_was(resumed):
-    design, found = resumed()
-    assert found == design
+    """By either command."""
+    for name in ("train", "sweep"):
+        design, found = resumed(name=name)
+        assert found == dataclasses.replace(design, default=design.base)
 
 
 @pytest.mark.parametrize("flags", [["--discount", "0.4"], ["--exact"]])
 def test_a_sweep_that_goes_on_has_no_other_settings(resumed, flags):
     with pytest.raises(ValueError, match="goes on as it is: give --resume alone"):
         resumed(*flags)
-
-
-def test_a_run_that_goes_on_is_no_sweep(tmp_path):
-    (tmp_path / "config.json").write_text("{}")
-    with pytest.raises(ValueError, match="is a run: "):
-        command_line.parse_sweep(["--resume", str(tmp_path)])

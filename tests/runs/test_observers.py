@@ -6,9 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mjx_reinforce.runs import run_files, saving
+from mjx_reinforce.runs import saving
 from mjx_reinforce.runs.display import Display
-from mjx_reinforce.runs.run_files import Callbacks, RunFiles
+from mjx_reinforce.runs.results import Callbacks
+from mjx_reinforce.runs.saving import RunFiles
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.checkpoint import Checkpoint
 
@@ -25,6 +26,8 @@ class Run:
             finished=lambda: self.finished,
             env_steps=np.zeros(2, int),
             training=dict,
+            history=dict,
+            threshold=None,
         )
 
     def updates(self):
@@ -52,12 +55,12 @@ def watched(tmp_path, monkeypatch):
 
     for owner, name, what in (
         (saving, "write_json", lambda path, _: path.name),
-        (run_files, "save_policy", lambda folder, actor, settings: f"{actor} policies"),
-        (run_files.files, "append", lambda path, _: path.name),
-        (run_files.checkpoint, "save", lambda _, x, even: f"checkpoint of {x.seconds}"),
+        (saving, "save_policy", lambda folder, actor, settings: f"{actor} policies"),
+        (saving.files, "append", lambda path, _: path.name),
+        (saving.checkpoint, "save", lambda _, x, even: f"checkpoint of {x.seconds}"),
     ):
         monkeypatch.setattr(owner, name, lambda *x, what=what, **more: write(what(*x, **more)))
-    monkeypatch.setattr(run_files, "draw", lambda driver: b"png")
+    monkeypatch.setattr(saving.curves, "picture", lambda *given: b"png")
     return files, written, full, said, run
 
 
@@ -79,6 +82,16 @@ def test_a_checkpoint_is_written_once_there_were_enough_updates(watched):
     for updates in (4, 7):
         go_on(files, run, updates)
     assert written == saved(4)
+
+
+def test_a_checkpoint_is_due_after_a_minute(watched, monkeypatch):
+    files, written, _, _, run = watched
+    run.config, now = Config(num_seeds=2, checkpoint_every=None), [files._at]
+    monkeypatch.setattr(saving.time, "perf_counter", lambda: now[0])
+    for passed, expected in ((59.0, []), (1.0, saved(10**9)), (59.0, saved(10**9))):
+        now[0] += passed
+        go_on(files, run, 10**9)
+        assert written == expected
 
 
 def test_the_last_state_is_saved_once_and_with_its_evaluation(watched):
@@ -104,6 +117,9 @@ def test_a_full_disk_is_a_warning_once_and_is_tried_again(watched):
     full.clear()
     files.ended(run)
     assert "checkpoint of 8" in written
+    full.add("checkpoint of 12")
+    go_on(files, run, 12)
+    assert len(said) == 3
 
 
 def test_rows_go_to_the_table_and_to_each_sink(watched):

@@ -14,11 +14,9 @@ from mjx_reinforce import envs
 from mjx_reinforce.engine.memory import gigabytes
 from mjx_reinforce.runs import command_line, plan
 from mjx_reinforce.runs.design import Design, check_design
-from mjx_reinforce.settings import tables
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.settings.defaults import of_task
-from mjx_reinforce.settings.tables import PRESETS
-from mjx_reinforce.training import memory
+from mjx_reinforce.settings.defaults import HORIZONS, MINUTES, PRESETS, of_task
+from mjx_reinforce.training import slots
 from mjx_reinforce.training.division import divide_run
 
 
@@ -63,8 +61,8 @@ def test_help_shows_the_defaults_of_the_task(capsys):
     assert "Defaults depend on the task" in said
 
 
-def test_what_was_measured_are_our_tasks():
-    assert set(tables.MINUTES) < set(tables.TASKS) <= set(envs.names())
+def test_what_is_known_of_tasks_is_of_ours():
+    assert set(MINUTES) < set(HORIZONS) <= set(envs.names())
 
 
 # Memory.
@@ -87,7 +85,7 @@ def test_what_does_not_fit_into_memory_is_refused_before_it_runs(
 ):
     """By what XLA says of its programs; a sweep takes narrower slots where these fit."""
     arguments = ["--env", "Survive-v0", "--eval-episodes", "2", "--num-episodes", "64"]
-    monkeypatch.setattr(memory, "memory_here", lambda: 3e4)
+    monkeypatch.setattr(slots, "memory_here", lambda: 3e4)
     assert run(*arguments, "--num-seeds", "2", "--output", "out") == 2
     assert "this does not fit into memory: it needs about 1 MB, 1 MB are" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
@@ -108,9 +106,9 @@ def test_a_plan_says_what_is_known(monkeypatch):
 @pytest.mark.parametrize(
     ("seeds", "episodes", "said"),
     [
-        (1, 7, "one mill, the first of the 4 here,"),
-        (1, 6, "3 of the 4 devices here (mill each), which share the episodes of an update"),
-        (8, 7, "4 devices (mill each), which share the seeds"),
+        (1, 7, "1 of the 4 devices here (mill)"),
+        (1, 6, "3 of the 4 devices here (mill), which share the episodes of an update"),
+        (8, 7, "4 of the 4 devices here (mill), which share the seeds"),
     ],
 )
 def test_a_plan_says_how_many_devices_compute(monkeypatch, seeds, episodes, said):

@@ -87,7 +87,7 @@ def test_what_makes_no_sense_is_refused(tmp_path):
     for observers in (print, [3]):
         with pytest.raises(ValueError, match="observers must be a list of functions of one"):
             mjx_reinforce.run(CONFIG, observers=observers)
-    with pytest.raises(ValueError, match="run\\(\\) begins a run"):
+    with pytest.raises(ValueError, match="this begins anew"):
         mjx_reinforce.run(dataclasses.replace(CONFIG, resume=tmp_path))
     with pytest.raises(ValueError, match="--num-seeds must be at least 1"):
         mjx_reinforce.run(dataclasses.replace(CONFIG, num_seeds=0), output=tmp_path / "new")

@@ -23,11 +23,11 @@ from mjx_reinforce import train as train_module
 from mjx_reinforce.export.player import load_seed
 from mjx_reinforce.export.run_files import choose_seed, read_run
 from mjx_reinforce.report import WrittenReport
-from mjx_reinforce.runs import conduct, plan, sweep_command
-from mjx_reinforce.runs.design import Design, check_design, configure, grid, read_design
+from mjx_reinforce.runs import command_line, conduct, plan
+from mjx_reinforce.runs.design import Design, check_design, read_design
 from mjx_reinforce.runs.plan import make_groups
 from mjx_reinforce.runs.results import read_results
-from mjx_reinforce.runs.sweep_files import SweepFiles, join_parts
+from mjx_reinforce.runs.saving import SweepFiles, join_parts
 from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.store import ready
 from mjx_reinforce.store.build import build
@@ -48,8 +48,8 @@ RATES = "--over learning-rate 1e-2 3e-2 1e-1"
 @pytest.fixture
 def run(run, monkeypatch):
     """Runs a sweep of arguments in one string; the report has tests of its own."""
-    monkeypatch.setattr(sweep_command, "_report", lambda directory: WrittenReport(0.0, [], 0))
-    return lambda line, command=sweep_command: run(*line.split(), command=command)
+    monkeypatch.setattr(command_line, "_report", lambda directory: WrittenReport(0.0, [], 0))
+    return lambda line, command=command_line.sweep: run(*line.split(), command=command)
 
 
 def curves(directory):
@@ -85,7 +85,7 @@ def test_a_run_is_that_of_train(run):
         "decay_steps": 40,
     }
     alone = "--learning-rate 3e-2 --initial-std 0.6 --decay-steps 40 --output alone"
-    assert run(f"{shared} {alone}", train_module) == 0
+    assert run(f"{shared} {alone}", train_module.main) == 0
     rows = list(csv.DictReader(Path("alone/metrics.csv").read_text().splitlines()))
     for name in ("eval_return", "env_steps"):
         expected = np.array([float(row[name]) for row in rows]).reshape(-1, 2)
@@ -155,11 +155,9 @@ def test_numbers_of_shifts_dampings_and_values_are_traced(monkeypatch):
         hidden_sizes=(4,),
         engine="vmap",
     )
-    configs = [
-        dataclasses.replace(base, entropy_cost=cost, standardize_floor=floor)
-        for cost, floor in ((0.0, 0.1), (0.5, 1.0))
-    ]
-    (group,) = make_groups(configs, ("entropy_cost",), exact=True)
+    swept = {"entropy_cost": [0.0, 0.5], "standardize_floor": [0.1, 1.0]}
+    design = Design(base=base, over=swept, exact=True)
+    (group,) = make_groups(design)
     assert {"entropy_cost", "standardize_floor", "max_kl", "value_learning_rate"} <= {
         *group.settings
     }
@@ -173,7 +171,7 @@ def test_numbers_of_shifts_dampings_and_values_are_traced(monkeypatch):
 
     together = jax.jit(jax.vmap(lambda settings: trained(builder(settings))))(group.settings)
     found = []
-    for number, config in enumerate(configs):
+    for number, config in enumerate(design.configs):
         alone = jax.jit(lambda config=config: trained(build(Drift(), config)[0]))()
         jax.tree.map(
             lambda x, y, number=number: np.testing.assert_allclose(x[number], y, atol=1e-4),
@@ -181,7 +179,7 @@ def test_numbers_of_shifts_dampings_and_values_are_traced(monkeypatch):
             alone,
         )
         found.append(np.concatenate([np.ravel(x) for x in jax.tree.leaves(alone)]))
-    assert np.abs(found[0] - found[1]).max() > 1e-3
+    assert np.abs(found[0] - found[-1]).max() > 1e-3
 
 
 #: Runs end one by one, for the noisier their actions are the shorter are their episodes.
@@ -195,24 +193,24 @@ def whole(tmp_path_factory):
     """A sweep of chunks that nothing stopped."""
     directory = tmp_path_factory.mktemp("sweep")
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(directory), added_environments():
-        patch.setattr(sweep_command, "_report", lambda directory: WrittenReport(0.0, [], 0))
-        patch.setattr(plan, "_CPU_EPISODES", (16, 4))
-        assert run_command(*CHUNKS.split(), "--output", "whole", command=sweep_command) == 0
+        patch.setattr(command_line, "_report", lambda directory: WrittenReport(0.0, [], 0))
+        patch.setattr(plan, "_CPU_EPISODES", 16)
+        assert run_command(*CHUNKS.split(), "--output", "whole", command=command_line.sweep) == 0
     return directory / "whole"
 
 
-def in_place(chosen, lengths, widths, num_devices):
+def in_place(chosen, lengths, width, num_devices):
     """A packing that leaves all runs in their lanes until the last has ended."""
     del lengths, num_devices
-    lanes = np.full(-(-len(chosen) // widths[0]) * widths[0], -1)
+    lanes = np.full(-(-len(chosen) // width) * width, -1)
     lanes[: len(chosen)] = np.arange(len(chosen))
-    return lanes.reshape(-1, widths[0])
+    return lanes.reshape(-1, width)
 
 
 @pytest.mark.slow
 @pytest.mark.cpu
 def test_packing_changes_nothing(run, monkeypatch):
-    """Neither which runs share a slot, nor how wide it is, nor that those that ended lie aside."""
+    """Neither which runs share a slot, nor that those that ended lie aside."""
     # With this seed one run trains last, alone.
     command = f"{STEPS} --num-seeds 4 --seed 2"
     shapes, packing = [], slots.pack_slots
@@ -221,14 +219,14 @@ def test_packing_changes_nothing(run, monkeypatch):
         shapes.append(packing(*arguments).shape)
         return packing(*arguments)
 
-    monkeypatch.setattr(plan, "_CPU_EPISODES", (16, 4))
+    monkeypatch.setattr(plan, "_CPU_EPISODES", 16)
     monkeypatch.setattr(slots, "pack_slots", packed)
     assert run(f"{command} --output packed") == 0
     assert shapes[0] == (3, 4)
-    assert shapes[-2] == (1, 1)
+    assert shapes[-2] == (1, 4)
     assert shapes[-1] == shapes[0]  # the last policies of all are evaluated together
-    assert len(set(shapes)) > 3
-    monkeypatch.setattr(plan, "_CPU_EPISODES", (48,))
+    assert set(shapes) == {(3, 4), (2, 4), (1, 4)}
+    monkeypatch.setattr(plan, "_CPU_EPISODES", 48)
     monkeypatch.setattr(slots, "pack_slots", in_place)
     assert run(f"{command} --output wide") == 0
     one, other = curves(Path("packed")), curves(Path("wide"))
@@ -240,7 +238,7 @@ def test_packing_changes_nothing(run, monkeypatch):
 def test_blocks_without_a_pause_change_nothing(run, monkeypatch):
     """Runs that one slot holds make several blocks before the host looks at them."""
     command = f"{STEPS} --num-seeds 2"
-    monkeypatch.setattr(plan, "_CPU_EPISODES", (24,))
+    monkeypatch.setattr(plan, "_CPU_EPISODES", 24)
     made, advance = [], slots.Slots.advance
 
     def counted(*arguments, **options):
@@ -267,13 +265,14 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
 
     What ended is not trained again, and its report is written if it is not there.
     """
-    monkeypatch.setattr(plan, "_CPU_EPISODES", (16, 4))
-    drive, driven, ended, tried = driver.drive, [], [], []
+    monkeypatch.setattr(plan, "_CPU_EPISODES", 16)
+    drive, driven, ended, tried = driver.Training.drive, [], [], []
     add, save, write = SweepFiles._write_part, SweepFiles._save_checkpoint, checkpoint.save
 
     def interrupted(*arguments):
         driven.append(None)
-        return drive(*arguments) if len(driven) == 1 else iter(())
+        if len(driven) == 1:
+            drive(*arguments)
 
     def crash_among_ended(self, driver):
         save(self, driver)
@@ -292,7 +291,7 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
         write(*arguments, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(driver, "drive", interrupted)
+        patch.setattr(driver.Training, "drive", interrupted)
         assert run(f"{CHUNKS} --output parts") == 0
     assert json.loads(Path("parts/sweep.json").read_text())["status"] == "interrupted"
     for name, crash in (
@@ -315,7 +314,7 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
     assert same(curves(whole), curves(Path("parts")))
     reported, written = [], WrittenReport(1.0, [], 0)
     monkeypatch.setattr(
-        sweep_command, "_report", lambda directory: reported.append(directory) or written
+        command_line, "_report", lambda directory: reported.append(directory) or written
     )
     assert run("--resume parts") == 0  # killed before the report was written
     assert reported == [Path("parts")]
@@ -389,7 +388,7 @@ def test_what_a_kill_left_of_a_report_goes(tmp_path, monkeypatch):
         path.write_text("half")
     nothing = WrittenReport(0.0, [], 0)
     monkeypatch.setattr("mjx_reinforce.report.write_report", lambda chosen, output: nothing)
-    assert sweep_command._report(tmp_path) == nothing
+    assert command_line._report(tmp_path) == nothing
     assert not any(path.exists() for path in left)
 
 
@@ -411,8 +410,7 @@ def test_what_ended_earlier_repeats_its_last_row():
 
 def test_numbers_share_a_program_and_the_rest_does_not():
     over = {"learning_rate": [1e-3, 1e-2], "max_grad_norm": [1.0, None, 2.0]}
-    configs = configure(Config(), grid(over))
-    groups = make_groups(configs, tuple(over), exact=False)
+    groups = make_groups(Design(base=Config(), over=over))
     assert [group.members.tolist() for group in groups] == [[0, 2, 3, 5], [1, 4]]
     assert groups[0].settings["max_grad_norm"].tolist() == [1.0, 2.0, 1.0, 2.0]
     # Left alone, it follows the first rate.
@@ -434,7 +432,7 @@ def test_numbers_share_a_program_and_the_rest_does_not():
         ("--over learning-rate 1e-2 1e-3 --log wandb", "--log logs a run"),
         ("--update natural-gradient --over max-kl None 0.1", "from --max-kl, which is None"),
         ("--over learning-rate 1 2 --num-seeds 2000000000", "results of 4,000,000,000 runs do not"),
-        ("--resume nowhere", "there is no nowhere/sweep.json"),
+        ("--resume nowhere", "there is no config.json or sweep.json"),
     ],
 )
 def test_bad_sweeps_are_refused(run, capsys, tmp_path, monkeypatch, arguments, message):
@@ -463,16 +461,17 @@ def test_what_every_configuration_sets_need_not_be_given_besides(base, over):
 
 
 def test_a_flag_that_one_configuration_reads_is_accepted():
-    configurations = grid({"estimator": ["leave-one-out", "value-baseline"]})
-    configure(Config(value_fits=3), configurations, given=["value_fits"])
+    over = {"estimator": ["leave-one-out", "value-baseline"]}
+    check_design(Design(base=Config(value_fits=3), over=over, default=Config()))
+    rates = {"final_learning_rate": [1e-3, 1e-2]}
     with pytest.raises(ValueError, match="would do nothing"):
-        configure(Config(decay_steps=None), grid({"final_learning_rate": [1e-3, 1e-2]}))
+        check_design(Design(base=Config(decay_steps=None), over=rates))
 
 
 @pytest.mark.slow
 def test_from_python_it_is_reported_on(register, monkeypatch, tmp_path, capsys):
     written = WrittenReport(1.5, ["The best is learning rate 0.03.", "It is sure."], 1)
-    monkeypatch.setattr(sweep_command, "_report", lambda directory: written)
+    monkeypatch.setattr(command_line, "_report", lambda directory: written)
     base = Config(
         env="Drift-v0", num_seeds=2, num_episodes=4, eval_episodes=2, env_steps=None, max_updates=2
     )

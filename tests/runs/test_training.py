@@ -9,6 +9,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.runs import conduct
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store.ready import made
+from mjx_reinforce.training.driver import Runs
 from mjx_reinforce.training.slots import compile_run
 
 CONFIG = Config(
@@ -27,7 +28,9 @@ CONFIG = Config(
 
 def begin(ready, config, **more):
     """A run with these settings, without files, before its first update."""
-    return conduct.begin_run(config, ready, compile_run(ready.programs(), config), **more)
+    slots = compile_run(ready.programs(), config)
+    runs = Runs("", *np.zeros((3, config.num_seeds), int))
+    return conduct.begin_run(config, ready, slots, runs, **more)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ from typing import Literal
 import pytest
 
 from mjx_reinforce.settings.flags import (
-    asks_brief_help,
     cannot_load,
     read_command_line,
     run_command,
@@ -36,8 +35,8 @@ class Form:
     group: Group = Group()
 
 
-def read(*words, main=()):
-    return read_command_line(Form, words, "prog", "What it does.", main)
+def read(*words):
+    return read_command_line(Form, words, "prog", "What it does.")
 
 
 def test_what_is_not_said_stays_as_it_is():
@@ -68,32 +67,15 @@ def test_what_cannot_be_read_is_said_by_tyro_and_in_our_words(words, message, ca
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("words", "brief"),
-    [("--help", True), ("-h", True), ("--help all", False), ("--rate 1", False), ("-h x", True)],
-)
-def test_the_help_is_brief_unless_all_is_asked_for(words, brief):
-    assert asks_brief_help(words.split()) == brief
-
-
-def test_the_brief_help_shows_the_main_settings_and_how_to_see_all(capsys, monkeypatch):
+def test_the_help_shows_every_setting(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     with pytest.raises(SystemExit):
-        read("--help", main=["number", "quick"])
+        read("--help")
     page = capsys.readouterr().out
     assert "What it does." in page
     assert "--number INT" in page
     assert "How many there are, in one paragraph." in page
-    assert "--rate" not in page
-    assert "--help all shows all settings." in page
-
-
-def test_the_whole_help_shows_every_setting(capsys):
-    with pytest.raises(SystemExit):
-        read("--help", "all", main=["number"])
-    page = capsys.readouterr().out
-    assert all(f"--{name}" in page for name in ("number", "rate", "place", "kind", "sizes"))
-    assert "--help all shows" not in page
+    assert all(f"--{name}" in page for name in ("rate", "place", "kind", "sizes"))
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """Budgets: those of the defaults, in time, and of runs that begin where others ended."""
 
 import dataclasses
-import errno
 import itertools
 import json
 from types import SimpleNamespace
@@ -13,10 +12,10 @@ from experiments.kit.trainings import results
 from mjx_reinforce.learning import counts
 from mjx_reinforce.runs import conduct
 from mjx_reinforce.runs.command_line import parse
-from mjx_reinforce.settings import defaults, tables
+from mjx_reinforce.settings import defaults
 from mjx_reinforce.settings.config import MAX_COUNT, Config, check
 from mjx_reinforce.settings.defaults import of_task
-from mjx_reinforce.training import checkpoint, progress
+from mjx_reinforce.training import record as measured
 
 SMALL = ["--env", "ContinuousCartPole-v0", "--num-seeds", "3", "--eval-episodes", "2"]
 SMALL += ["--num-episodes", "4", "--hidden-sizes", "4"]
@@ -62,18 +61,18 @@ def test_minutes_become_env_steps_that_repeat_the_run_and_go_on(run, tmp_path, c
 @pytest.mark.parametrize("gpu", [False, True])
 def test_a_default_run_has_the_budget_of_its_machine(monkeypatch, gpu):
     monkeypatch.setattr(defaults, "has_gpu", lambda: gpu)
-    for env in tables.OF_TASKS:
+    for env in defaults.OF_TASKS:
         config = of_task(env)
         check(config)
-        assert config.env_steps == tables.MINUTES.get(env, (Config.env_steps,) * 2)[gpu]
+        assert config.env_steps == defaults.MINUTES.get(env, (Config.env_steps,) * 2)[gpu]
         # More seeds than a default run has leave each with what it would learn.
         assert of_task(env, num_seeds=1000) == dataclasses.replace(config, num_seeds=1000)
         assert parse(["--env", env]).base == config
-        if gpu and env in tables.OF_BUDGETS:
+        if gpu and env in defaults.OF_BUDGETS:
             assert config.num_episodes >= 128
         longer = of_task(env, minutes=2.0)
-        assert longer.env_steps == 2 * config.env_steps or env not in tables.MINUTES
-        played = longer.episodes_per_update * longer.eval_every * tables.TASKS[env].horizon
+        assert longer.env_steps == 2 * config.env_steps or env not in defaults.MINUTES
+        played = longer.episodes_per_update * longer.eval_every * defaults.HORIZONS[env]
         assert longer.env_steps < 60 * played
     alone = of_task("Walker2d-v5", num_seeds=1)  # two cores play more of one seed
     assert (alone.env_steps == 4 * 3_900_000) != gpu
@@ -146,45 +145,8 @@ def test_what_is_trained_in_a_time(monkeypatch, seconds, machine, config, expect
 
 def test_the_budget_that_is_nearer_to_its_end_counts():
     steps, updates = np.array([[50, 200], [0, 0]]), np.array([[9, 1], [5, 0]])
-    both = progress.used(Config(env_steps=100, max_updates=10), steps, updates)
+    both = measured.used(Config(env_steps=100, max_updates=10), steps, updates)
     np.testing.assert_allclose(both, [[0.9, 2.0], [0.5, 0.0]])
-    alone = progress.used(Config(env_steps=None, max_updates=10), steps, updates)
+    alone = measured.used(Config(env_steps=None, max_updates=10), steps, updates)
     np.testing.assert_allclose(alone, [[0.9, 0.1], [0.5, 0.0]])
-    np.testing.assert_allclose(progress.used(Config(env_steps=100), steps, updates), steps / 100)
-
-
-def test_a_checkpoint_is_due_after_so_many_updates():
-    due = checkpoint.SaveDue(5)
-    assert [due.is_due(n) for n in (0, 4, 5, 6)] == [False, False, True, True]
-    due.saved(6)
-    assert [due.is_due(n) for n in (6, 10, 11)] == [False, False, True]
-
-
-def test_a_checkpoint_is_due_after_a_minute(monkeypatch):
-    now = [100.0]
-    monkeypatch.setattr(checkpoint.time, "perf_counter", lambda: now[0])
-    due = checkpoint.SaveDue(None)
-    now[0] += 59.0
-    assert not due.is_due(10**9)
-    now[0] += 1.0
-    assert due.is_due(0)
-    due.saved(0)
-    assert not due.is_due(0)
-
-
-@pytest.mark.parametrize(
-    ("error", "said"),
-    [(OSError(errno.ENOSPC, "No space left on device"), "No space"), (OSError("gone"), "gone")],
-)
-def test_the_first_failure_in_a_row_is_a_warning(error, said):
-    heard, fails = [], [True, True, False, True]
-    attempts = checkpoint.Attempts(heard.append)
-
-    def write():
-        if fails.pop(0):
-            raise error
-
-    written = [attempts.attempt("metrics.csv", write) for _ in range(4)]
-    assert written == [False, False, True, False]
-    assert len(heard) == 2
-    assert heard[0].startswith(f"warning: cannot write metrics.csv ({said}")
+    np.testing.assert_allclose(measured.used(Config(env_steps=100), steps, updates), steps / 100)

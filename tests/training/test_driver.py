@@ -6,12 +6,13 @@ import numpy as np
 
 from mjx_reinforce.learning import counts
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training.driver import Driver
+from mjx_reinforce.training.driver import Driver, Runs
 from mjx_reinforce.training.record import RunRecord
 from mjx_reinforce.training.slots import Measured
 from mjx_reinforce.training.state import Best, first_best, keep_best
 
 BLOCK = 2
+RUNS = Runs("000-0000", *np.zeros((3, 2), int))
 CONFIG = Config(num_seeds=2, env_steps=None, max_updates=3 * BLOCK, eval_every=BLOCK)
 
 
@@ -77,7 +78,7 @@ class Diary:
 def driver_of(steps, *observers, config=CONFIG, threshold=None):
     record = RunRecord(config, threshold)
     record.add_test = lambda result: None
-    return Driver(config, steps, record, observers)
+    return Driver(config, steps, record, RUNS, observers)
 
 
 def never():

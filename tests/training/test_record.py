@@ -14,10 +14,10 @@ from mjx_reinforce.engine.base import Trajectory
 from mjx_reinforce.runs import display
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import summarize
-from mjx_reinforce.training import progress
+from mjx_reinforce.training import record as measured
 from mjx_reinforce.training.block import evaluate
-from mjx_reinforce.training.progress import Progress
-from mjx_reinforce.training.record import RunRecord
+from mjx_reinforce.training.record import Progress, RunRecord
+from mjx_reinforce.training.slots import Measured
 
 
 def block(random, num_updates, num_seeds):
@@ -45,13 +45,21 @@ def evaluation(*returns):
     }
 
 
+def looked(*returns):
+    return Measured(np.arange(len(returns)), {}, evaluation(*returns))
+
+
+def made(metrics):
+    return Measured(np.arange(metrics["active"].shape[1]), metrics, {})
+
+
 def filled():
     """A record of three seeds, two blocks and three evaluations."""
     record, random = RunRecord(Config(num_seeds=3, max_updates=100), 2.0), np.random.default_rng(0)
-    record.add_evaluation(evaluation(1, 2, 3), 0.1)
+    record.add_evaluation(looked(1, 2, 3), 0.1)
     for i in range(2):
-        record.add_updates(block(random, 4, 3))
-        record.add_evaluation(evaluation(i, np.nan, -3.5), 1.0 + i / 3)
+        record.add_updates(made(block(random, 4, 3)))
+        record.add_evaluation(looked(i, np.nan, -3.5), 1.0 + i / 3)
     return record
 
 
@@ -77,8 +85,8 @@ def test_a_record_is_restored_exactly(tmp_path):
         assert repr(record.progress()) == repr(copy.progress())
         both = []
         for x in (record, copy):
-            x.add_updates(block(np.random.default_rng(i), 5, 3))
-            both.append(x.add_evaluation(evaluation(5, 6, i), 3.0))
+            x.add_updates(made(block(np.random.default_rng(i), 5, 3)))
+            both.append(x.add_evaluation(looked(5, 6, i), 3.0))
         assert repr(both[0]) == repr(both[1])
 
 
@@ -99,15 +107,15 @@ METRICS = {  # two updates of two seeds; the second seed stands still in the sec
 def test_a_record_of_two_seeds_by_hand():
     config = Config(num_seeds=2, num_episodes=2, env_steps=60)
     record = RunRecord(config, threshold=8.0)
-    first = record.add_evaluation(evaluation(1, 9), 0.5)
+    first = record.add_evaluation(looked(1, 9), 0.5)
     assert first["train_return"] == ["", ""]
     assert record.is_evaluated()
     assert not record.finished()
     assert record.progress().fraction == 0
-    met = record.add_updates(METRICS)
+    met = record.add_updates(made(METRICS))
     assert not record.is_evaluated()
     assert met.tolist() == [1, 0]
-    second = record.add_evaluation(evaluation(7, 10), 2.00009)
+    second = record.add_evaluation(looked(7, 10), 2.00009)
     keys = ("seed", "update", "episodes", "env_steps", "wall_seconds", "train_return")
     assert [*zip(*(second[key] for key in keys), strict=True)] == [
         ("0", "2", "4", "70", "2.000", "nan"),
@@ -115,8 +123,8 @@ def test_a_record_of_two_seeds_by_hand():
     ]
     assert second["skipped_update"] == ["1", "0"]
     progress = record.progress()
-    assert progress[:-3] == (40 / 60, 2, 55.0, 8.5, 7.0, 0, 2)
-    np.testing.assert_allclose(progress[-3:], [55, 110 / 1.5, 1.5 / 2], rtol=1e-3)
+    assert progress[:-2] == ((1 + 40 / 60) / 2, 2, 55.0, 8.5, 7.0, 0, 2)
+    np.testing.assert_allclose(progress[-2:], [55, 1.5 / 5], rtol=1e-3)
     assert not record.finished()
     np.testing.assert_array_equal(record.training()["episode_return"], [[3, 4], [np.nan] * 2])
     np.testing.assert_array_equal(record.training()["env_steps"], [[30, 40], [70, 40]])
@@ -148,23 +156,23 @@ def test_a_seed_is_broken_while_nothing_of_it_is_finite():
         "skipped_update": np.array([[0, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0]]),
         "episodes": np.full((3, 4), 4),
     }
-    count = progress.broken_in_a_row(np.array([2, 0, 5, 1]), metrics)
+    count = measured.broken_in_a_row(np.array([2, 0, 5, 1]), metrics)
     assert count.tolist() == [5, 3, 2, 2]
 
 
 def test_a_run_is_hopeless_if_all_that_train_are():
     count = np.array([5, 9, 0])
-    assert progress.hopeless(count, np.array([0.1, 0.5, 1.0]), block=5)
-    assert progress.hopeless(count, np.array([0.1, 0.5, 1.0]), block=1)
-    assert not progress.hopeless(count, np.array([0.1, 0.5, 0.9]), block=5)
-    assert not progress.hopeless(count, np.array([0.1, 0.5, 1.0]), block=6)
-    assert not progress.hopeless(count - 1, np.array([0.1, 0.5, 1.0]), block=1)
-    assert not progress.hopeless(count, np.ones(3), block=5)
+    assert measured.hopeless(count, np.array([0.1, 0.5, 1.0]), block=5)
+    assert measured.hopeless(count, np.array([0.1, 0.5, 1.0]), block=1)
+    assert not measured.hopeless(count, np.array([0.1, 0.5, 0.9]), block=5)
+    assert not measured.hopeless(count, np.array([0.1, 0.5, 1.0]), block=6)
+    assert not measured.hopeless(count - 1, np.array([0.1, 0.5, 1.0]), block=1)
+    assert not measured.hopeless(count, np.ones(3), block=5)
 
 
 def test_a_block_of_broken_updates_is_one_line():
     met = np.repeat([0, 2], [994, 6])
-    assert progress.describe_nonfinite(met, 7, 9) == (
+    assert measured.describe_nonfinite(met, 7, 9) == (
         "up to update 9: 6 of 1,000 seeds met numbers that are not finite or beyond 1e10 "
         "(1001, 1002, 1003, 1004, 1005, ...), in 12 updates"
     )
@@ -176,33 +184,33 @@ def test_percentages_are_rounded_down():
 
 
 def screen(width):
-    return Console(file=io.StringIO(), width=width, force_terminal=True, color_system=None)
+    return Console(
+        file=io.StringIO(), width=width, force_terminal=True, color_system=None, markup=False
+    )
 
 
 def test_a_progress_line_fits_in_80_columns(monkeypatch):
-    """With the returns, both speeds, failed seeds, the time that passed and the time left."""
+    """With the returns, the speed, failed seeds, the time that passed and the time left."""
     console = screen(80)
     monkeypatch.setattr(display, "_Screen", lambda **_: console)
     with display.Display() as shown:
         shown.start(1.0)
-        shown.show_progress(
-            Progress(0.4567, 12, 3e4, 12345.6, np.nan, 3, 1000, 123456.0, 234567.0, 45296.0)
-        )
+        shown.show_progress(Progress(0.4567, 12, 3e4, 12345.6, np.nan, 3, 1000, 123456.0, 45296.0))
     written = console.file.getvalue()
     for text in ("45.6 %", "0:00:00", "left 12:34:56", "return 12345.6"):
         assert text in written
-    assert "worst nan (3 of 1,000 seeds)  234,567 steps/s, mean 123,456\n" in written
+    assert "worst nan (3 of 1,000 seeds)  123,456 steps/s\n" in written
     assert "…" not in written
 
 
 def test_without_a_terminal_an_evaluation_is_one_line(monkeypatch, capsys):
     monkeypatch.setattr(display, "_Screen", lambda **_: Console(width=80))
     with display.Display() as shown:
-        shown.show_progress(Progress(0.0, 0, 0, 8.0, 7.0, 0, 2, np.nan, np.nan, np.nan))
-        shown.show_progress(Progress(0.25, 5, 4e4, 9.5, 7.0, 0, 2, 1000.0, 2000.0, 59.2))
+        shown.show_progress(Progress(0.0, 0, 0, 8.0, 7.0, 0, 2, np.nan, np.nan))
+        shown.show_progress(Progress(0.25, 5, 4e4, 9.5, 7.0, 0, 2, 1000.0, 59.2))
     first, second = capsys.readouterr().out.splitlines()
     assert first.endswith("return     8.0  worst     7.0  0.0 %")
-    assert second.endswith("worst     7.0  2,000 steps/s, mean 1,000  25.0 %  left 0:01:00")
+    assert second.endswith("worst     7.0  1,000 steps/s  25.0 %  left 0:01:00")
 
 
 @pytest.mark.parametrize("width", [60, 200])
@@ -221,7 +229,7 @@ def test_sentences_wrap_at_words_and_commands_do_not_wrap(monkeypatch, width):
     assert command == f"To see it:  {line}"
 
 
-def test_the_end_table_has_counts():
+def test_the_end_table_has_counts(monkeypatch):
     returns = np.full((1, 1000), 1000.0)
     returns[0, :3] = 573.6, 600.0, np.nan
     counts = np.full((1, 1000), 50_000)
@@ -235,10 +243,12 @@ def test_the_end_table_has_counts():
     }
     two = {name: values[:, :2] for name, values in history.items()}
     console = screen(200)
-    display.print_summary(console, summarize(two, 950.0) | more | {"num_seeds": 2}, Path("t"))
+    monkeypatch.setattr(display, "_Screen", lambda **_: console)
+    few = summarize(two, 950.0) | more | {"num_seeds": 2}
+    display.Display().show_summary(few, Path("t"))
     assert "586.8 (no interval: too few seeds)" in " ".join(console.file.getvalue().split())
     console = screen(80)
-    display.print_summary(console, summarize(history, 950.0) | more, Path("t/[bold]x"))
+    display.Display().show_summary(summarize(history, 950.0) | more, Path("t/[bold]x"))
     written = " ".join(console.file.getvalue().split())
     for text in (
         "seeds at 950, the task's threshold │ 997 of 1,000 at the end, 997 ever",

@@ -18,8 +18,8 @@ def test_each_run_has_one_lane_and_each_device_its_share(num_devices, active):
     random = np.random.default_rng(active)
     chosen = random.permutation(100) < active
     lengths = random.integers(1, 21, 100)
-    lanes = pack_slots(chosen, lengths, [32, 8], num_devices)
-    assert lanes.shape == ((-(-active // 32), 32) if active > 8 else (-(-active // 8), 8))
+    lanes = pack_slots(chosen, lengths, 32, num_devices)
+    assert lanes.shape == (-(-active // 32), 32)
     assert sorted(lanes[lanes >= 0]) == np.flatnonzero(chosen).tolist()
     shares = (lanes.reshape(len(lanes), num_devices, -1) >= 0).sum(axis=-1)
     assert np.all(shares.max(axis=1) - shares.min(axis=1) <= 1)
@@ -29,13 +29,13 @@ def test_each_run_has_one_lane_and_each_device_its_share(num_devices, active):
 
 def test_runs_of_equal_lengths_stay_in_order():
     """So that a resumed run packs as it would have."""
-    lanes = pack_slots(np.ones(40, bool), np.full(40, 3), [16], 1)
+    lanes = pack_slots(np.ones(40, bool), np.full(40, 3), 16, 1)
     assert lanes[lanes >= 0].tolist() == list(range(40))
 
 
 def test_what_is_measured_is_in_the_order_of_the_runs():
     """On several devices the lanes are dealt; a run's files have its seeds in order."""
-    lanes = pack_slots(np.ones(7, bool), np.zeros(7), [4], 2)
+    lanes = pack_slots(np.ones(7, bool), np.zeros(7), 4, 2)
     assert lanes.tolist() == [[0, 2, 1, 3], [4, 6, 5, -1]]
     slots = [({"steps": np.stack([each, -each])}, {"return": each}) for each in lanes]
     runs, metrics, looked = _of_slots(lanes, slots)
@@ -80,4 +80,4 @@ def test_waiting_for_a_program_is_compiling():
     clock = Stopwatch()
     assert clock.wait(started(lambda: time.sleep(0.2) or "program")) == "program"
     assert clock.compiling > 0
-    assert clock.running == 0
+    assert clock.running() < 0.1

@@ -21,7 +21,7 @@ from experiments.studies.reproduce.statistics import LEVEL, compare, compare_rep
 from mjx_reinforce import envs
 from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.settings.tables import PRESETS
+from mjx_reinforce.settings.defaults import PRESETS
 from mjx_reinforce.store.build import build, policy_settings
 from mjx_reinforce.training.programs import programs_of
 from mjx_reinforce.training.slots import compile_run

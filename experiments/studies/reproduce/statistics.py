@@ -7,7 +7,7 @@ import numpy as np
 from scipy import stats
 
 from experiments.studies.reproduce.cases import Case
-from mjx_reinforce.settings.tables import PRESETS
+from mjx_reinforce.settings.defaults import PRESETS
 
 LEVEL = 0.05  # of the tests; the range over seeds holds 95 % too
 

@@ -4,8 +4,7 @@ import dataclasses
 from typing import Any, NamedTuple
 
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.settings.defaults import of_task
-from mjx_reinforce.settings.tables import TASKS as MEASURED
+from mjx_reinforce.settings.defaults import HORIZONS, of_task
 
 #: Roots of all randomness of the results. No tuning used them. The second and the third are of
 #: tasks whose settings were chosen again after a run with the first.
@@ -68,6 +67,6 @@ def settings_of(task: Task) -> Config:
     config = dataclasses.replace(config, seed=task.root, **task.settings)
     if "eval_every" in task.settings:
         return config
-    horizon = config.horizon or MEASURED[task.env].horizon
+    horizon = config.horizon or HORIZONS[task.env]
     updates = -(-task.env_steps // (config.episodes_per_update * horizon))
     return dataclasses.replace(config, eval_every=max(config.eval_every, updates // _EVALUATIONS))
