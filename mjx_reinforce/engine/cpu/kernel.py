@@ -36,6 +36,8 @@ NUM_CONTROLS, NUM_RECORDS = 3, 3
 _LENGTH, _BROKEN = 3, 4
 
 
+#: What the queue looks at of a lane.
+_OF_LANES = ("alive", "seed", "episode", "step", "limit", "broken", "counted")
 _QUEUE = Path(__file__).with_name("queue.ll")
 
 
@@ -124,14 +126,8 @@ def queue_text(places: VectorLayout, lanes: int) -> str:
     values = {name: f"i32 0, i32 {number}" for number, name in enumerate(handler.FIELDS)}
     values |= {
         "lanes": str(lanes),
-        "alive_at": _lane("%alive.at", places.alive),
-        "seed_at": _lane("%seed.at", places.seed),
-        "episode_at": _lane("%episode.at", places.episode),
-        "step_at": _lane("%step.at", places.step),
-        "limit_at": _lane("%limit.at", places.limit),
-        "broken_at": _lane("%broken.at", places.broken),
-        "counted_at": _lane("%counted.at", places.counted),
         "deterministic_at": _lane("%mode.lane", places.deterministic),
+        **{f"{x}_at": _lane(f"%{x}.at", getattr(places, x)) for x in _OF_LANES},
         "limits_arg": str(handler.LIMITS),
         "not_played": str(NOT_PLAYED),
         "length_data": str(first_result + _LENGTH),

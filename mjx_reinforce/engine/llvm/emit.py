@@ -1,6 +1,5 @@
 """Turns the scalar graph into LLVM IR: one instruction on a lane vector for each node."""
 
-import itertools
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -33,14 +32,6 @@ class Memory(NamedTuple):
 
 #: An argument: lane vectors, one after the other.
 Input = Memory
-
-
-class Places(NamedTuple):
-    """Evenly spaced elements of one input: a loop can read them by their number."""
-
-    leaf: int
-    start: int
-    stride: int
 
 
 #: An operand, or where it lies.
@@ -252,9 +243,10 @@ class LLVM(Backend[Value]):
     ) -> Callable[[str], Value]:
         """Returns what an element is in the iteration of a number, an i64."""
         text, dtype = self._text, leaf.dtype
-        place = _evenly_spaced(row)
-        if place is not None:
-            return lambda count: self._place(place, dtype, count)
+        is_input = lambda x: isinstance(x, Node) and x.op is None and x.owner is None  # noqa: E731
+        spaced = liveness.evenly_spaced([x.position if is_input(x) else None for x in row])
+        if spaced:
+            return lambda count: self._place(*spaced, dtype, count)
         kept = self._kept_in_order(row)
         if kept is not None:
             kept_in, first = kept
@@ -278,20 +270,9 @@ class LLVM(Backend[Value]):
         in_order = all(self._kept.get(x) == (array, first + step * t) for t, x in enumerate(row))
         return (array, first) if array and in_order else None
 
-    def _place(self, place: Places, dtype: np.dtype, count: str) -> Value:
-        pointer, _, align = self._inputs(place.leaf)
-        step = self._text.let(f"mul i64 {count}, {place.stride}")
-        index = self._text.let(f"add i64 {step}, {place.start}")
-        align = math.gcd(align, dtype.itemsize * place.stride, dtype.itemsize * place.start)
+    def _place(self, leaf: int, start: int, stride: int, dtype: np.dtype, count: str) -> Value:
+        pointer, _, align = self._inputs(leaf)
+        step = self._text.let(f"mul i64 {count}, {stride}")
+        index = self._text.let(f"add i64 {step}, {start}")
+        align = math.gcd(align, dtype.itemsize * stride, dtype.itemsize * start)
         return Memory(self._text.at(pointer, dtype, index), dtype, align)
-
-
-def _evenly_spaced(row: Sequence[Scalar]) -> Places | None:
-    """Returns where the elements of a row are, if they are evenly spaced in one input."""
-    if not all(isinstance(x, Node) and x.op is None and x.owner is None for x in row):
-        return None
-    leaves = {x.position[0] for x in row}
-    strides = {b.position[1] - a.position[1] for a, b in itertools.pairwise(row)}
-    if len(leaves) != 1 or len(strides) != 1:
-        return None
-    return Places(leaves.pop(), row[0].position[1], strides.pop())

@@ -228,21 +228,6 @@ def default_platform(eqn: Any) -> int | None:
     return platforms.index(None) if None in platforms else None
 
 
-def depends(closed: Any, given: Iterable[bool]) -> list[bool]:
-    """Returns which results of a program may depend on some of its arguments.
-
-    Args:
-      closed: a closed jaxpr.
-      given: for each argument, whether it is one of them.
-    """
-    jaxpr = program(closed).jaxpr
-    found = {variable for variable, is_given in zip(jaxpr.invars, given, strict=True) if is_given}
-    for eqn in jaxpr.eqns:
-        if any(not is_literal(atom) and atom in found for atom in eqn.invars):
-            found.update(eqn.outvars)
-    return [not is_literal(out) and out in found for out in jaxpr.outvars]
-
-
 def scan_parts(eqn: Equation) -> tuple[int, int]:
     """Returns how the operands and results of a ``scan`` equation divide.
 

@@ -109,10 +109,9 @@ class CText(Backend[str]):
 
     def array(self, scalars: Sequence[Scalar]) -> str:
         """Returns an array of scalars of the program: where they are, or a new one."""
-        places = [self._place(x) for x in scalars]
-        first = places[0]
-        if first and places == [Place(first.array, first.entry + k) for k in range(len(places))]:
-            return f"({first.array} + {first.entry})"
+        found = liveness.evenly_spaced([self._place(x) for x in scalars])
+        if found and found[2] == int(len(scalars) > 1):
+            return f"({found[0]} + {found[1]})"
         array = self._reserve(scalars[0].dtype, len(scalars))
         self.fill(array, scalars)
         self.line("t.sync();")
@@ -333,14 +332,10 @@ class CText(Backend[str]):
 
     def _spaced(self, row: Sequence[Scalar]) -> Callable[[str], str] | None:
         """Returns what the k-th of evenly spaced elements of one array is; None for others."""
-        places = [self._place(x) for x in row]
-        first = places[0]
-        step = places[1].entry - first.entry if first and places[1:] and places[1] else 0
-        if first is None or any(
-            x != Place(first.array, first.entry + k * step) for k, x in enumerate(places)
-        ):
+        if not (found := liveness.evenly_spaced([self._place(x) for x in row])):
             return None
-        return lambda count: f"{first.array}[{first.entry} + {step} * {count}]"
+        array, start, stride = found
+        return lambda count: f"{array}[{start} + {stride} * {count}]"
 
     # ------------------------------------------------------------------------- lanes together
 

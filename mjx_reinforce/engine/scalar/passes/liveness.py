@@ -12,8 +12,8 @@ branch, also where it is skipped.
 
 import dataclasses
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 from mjx_reinforce.engine.scalar.nodes import SELECT, Call, Gate, Loop, Node, Scalar, Scope
 
@@ -114,6 +114,20 @@ def results(step: LiveGate | LiveLoop | Call) -> list[Node]:
         return [x for out in step.outs for x in out]
     outs = [carry.out for carry in step.carries]
     return [*outs, *(x for record in step.records for x in record.outs)]
+
+
+def evenly_spaced(places: Sequence[tuple[Any, int] | None]) -> tuple[Any, int, int] | None:
+    """Returns the array, the start and the stride of evenly spaced entries; None for others.
+
+    Args:
+      places: the array of each and where it is in it; None for what is in none.
+    """
+    first, second = places[0], places[min(1, len(places) - 1)]
+    if first is None or second is None:
+        return None
+    (array, start), stride = first, second[1] - first[1]
+    spaced = all(x == (array, start + k * stride) for k, x in enumerate(places))
+    return (array, start, stride) if spaced else None
 
 
 def nodes(body: Schedule) -> Iterator[Node]:

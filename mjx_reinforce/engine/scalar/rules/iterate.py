@@ -1,16 +1,17 @@
 """Builds loops of the scalar graph, whose carry is only what changes.
 
 ``iterate`` finds that out scalar by scalar, and writes the body two to four times for it. Of a body
-with loops inside that takes most of the time, and the variables of its jaxpr say as much: what
-stands after ``iterate`` foresees it.
+with loops inside that takes most of the time, and the variables of its jaxpr say as much: see
+``keeps``.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from mjx_reinforce.engine.scalar import jaxprs
 from mjx_reinforce.engine.scalar.graph import Graph
-from mjx_reinforce.engine.scalar.nodes import Loop, Node, Scalar, same
+from mjx_reinforce.engine.scalar.nodes import Loop, Node, Scalar, Scope, same
 
 #: (carry, elements of xs) -> (carry after one iteration, ys)
 Iteration = Callable[[list[Scalar], list[Scalar]], tuple[list[Scalar], list[Scalar]]]
@@ -29,16 +30,6 @@ class Assumption(NamedTuple):
     varying: list[bool]
 
 
-class _Plan(NamedTuple):
-    """What is to be repeated; the fields as in ``iterate``."""
-
-    step: Iteration
-    inits: list[Scalar]
-    length: int | None
-    active: int | None
-    xs: list[list[Scalar]]
-
-
 def iterate(
     graph: Graph,
     step: Iteration,
@@ -47,15 +38,14 @@ def iterate(
     length: int | None = None,
     active: int | None = None,
     xs: Sequence[list[Scalar]] = (),
-    foreseen: Assumption | None = None,
+    kept: list[bool] | None = None,
 ) -> Loop:
     """Builds a loop.
 
     Every carry is first assumed to keep its initial value. The body is evaluated on that
     assumption, carries that break it are dropped from it, and so on until it holds: then it holds
     in every iteration. The same is done for 'all lanes agree'. Where this loop was built before, as
-    part of an outer loop's body, that begins with what was found then, and else with what was
-    foreseen.
+    part of an outer loop's body, that begins with what was found then.
 
     Args:
       graph: where the loop is made.
@@ -64,15 +54,16 @@ def iterate(
       length: the number of iterations, or None for no limit.
       active: the position in the carry of the bool that ends the loop when no lane has it.
       xs: for each element, its value in each iteration.
-      foreseen: what is assumed first; what holds and is not assumed costs operations.
+      kept: which of the carry keep their values, where that is known of the variables; then the
+        others are assumed to vary.
     """
-    plan = _Plan(step, list(inits), length, active, list(xs))
-    place = (graph.path, active)
-    most = Assumption([True] * len(plan.inits), [False] * len(plan.inits))
-    fixed, varying = graph.learned.get(place) or foreseen or most
-    varying = [v or varies(init) for v, init in zip(varying, plan.inits, strict=True)]
+    make = functools.partial(Loop, graph.scope, 0, length, list(inits), active, list(xs))
+    place, count = (graph.path, active), len(inits)
+    first = Assumption(kept or [True] * count, [kept is not None] * count)
+    fixed, varying = graph.learned.get(place, first)
+    varying = [v or varies(init) for v, init in zip(varying, inits, strict=True)]
     while True:
-        loop = _trace_body(graph, plan, fixed, varying)
+        loop = _trace_body(graph, step, make, fixed, varying)
         moved = [f and not same(n, i) for f, n, i in zip(fixed, loop.nexts, inits, strict=True)]
         differs = [varies(n) and not v for n, v in zip(loop.nexts, varying, strict=True)]
         fixed = [f and not m for f, m in zip(fixed, moved, strict=True)]
@@ -87,26 +78,29 @@ def varies(scalar: Scalar) -> bool:
     return isinstance(scalar, Node) and scalar.varying
 
 
-def _trace_body(graph: Graph, plan: _Plan, fixed: list[bool], varying: list[bool]) -> Loop:
+def _trace_body(
+    graph: Graph,
+    step: Iteration,
+    make: Callable[[Scope], Loop],
+    fixed: list[bool],
+    varying: list[bool],
+) -> Loop:
     """Evaluates one iteration under the present assumptions."""
-    scope = graph.scope
     with graph.loop_body() as body:
-        loop = Loop(scope, 0, plan.length, plan.inits, plan.active, plan.xs, body)
-        for i, (init, same_throughout, v) in enumerate(
-            zip(plan.inits, fixed, varying, strict=True)
-        ):
-            leaf = None if same_throughout else graph.leaf(init.dtype, v, loop, ("carry", i))
+        loop = make(body)
+        for i, (init, is_fixed, v) in enumerate(zip(loop.inits, fixed, varying, strict=True)):
+            leaf = None if is_fixed else graph.leaf(init.dtype, v, loop, ("carry", i))
             loop.carries.append(leaf)
-        for j, row in enumerate(plan.xs):
+        for j, row in enumerate(loop.xs):
             same_throughout = all(same(x, row[0]) for x in row)
             v = any(map(varies, row))
             leaf = None if same_throughout else graph.leaf(row[0].dtype, v, loop, ("element", j))
             loop.elements.append(leaf)
-        state = [init if c is None else c for init, c in zip(plan.inits, loop.carries, strict=True)]
-        parts = [row[0] if e is None else e for row, e in zip(plan.xs, loop.elements, strict=True)]
+        state = [init if c is None else c for init, c in zip(loop.inits, loop.carries, strict=True)]
+        parts = [row[0] if e is None else e for row, e in zip(loop.xs, loop.elements, strict=True)]
         # Where all lanes are done, no iteration runs.
-        with graph.assuming(None if plan.active is None else state[plan.active]):
-            loop.nexts, loop.ys = plan.step(state, parts)
+        with graph.assuming(None if loop.active is None else state[loop.active]):
+            loop.nexts, loop.ys = step(state, parts)
     return loop
 
 
@@ -145,20 +139,6 @@ def keeps(body: jaxprs.Program, first: int, count: int) -> list[bool]:
     """
     sources = _sources(body)
     return [sources[k] == first + k for k in range(count)]
-
-
-def spread(step: Callable[[list[bool]], list[bool]], varying: list[bool]) -> list[bool]:
-    """Returns which variables of the carry differ from lane to lane in some iteration.
-
-    Args:
-      step: which do after an iteration, given which do before it.
-      varying: which do before the first.
-    """
-    while True:
-        after = [v or s for v, s in zip(varying, step(varying), strict=True)]
-        if after == varying:
-            return varying
-        varying = after
 
 
 def _sources(program: jaxprs.Program) -> list[int | None]:

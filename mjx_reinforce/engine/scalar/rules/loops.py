@@ -5,7 +5,7 @@ cheap branches are both evaluated, and expensive ones skipped if unneeded. Of ``
 is selected.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +25,7 @@ from mjx_reinforce.engine.scalar.nodes import (
     same,
 )
 from mjx_reinforce.engine.scalar.rules import iterate
-from mjx_reinforce.engine.scalar.rules.iterate import Assumption, Iteration, varies
+from mjx_reinforce.engine.scalar.rules.iterate import Iteration, varies
 
 
 def while_rule(graph: Graph, run: Callable, eqn: Equation, used: Any, *operands: Array) -> Results:
@@ -50,21 +50,10 @@ def while_rule(graph: Graph, run: Callable, eqn: Equation, used: Any, *operands:
     active = goes_on(start)
     if is_constant(active) and not active:
         return carry.pack(start)
-    foreseen = None
+    kept = None
     if iterate.has_loops(body) or iterate.has_loops(cond):
-        kept = iterate.keeps(body, num_body, len(eqn.outvars))
-        outside, inside = _varying(cond_consts), _varying(body_consts)
-
-        def after(varying: list[bool]) -> list[bool]:
-            new = jaxprs.depends(body, [*inside, *varying[1:]])
-            new = [n or (varying[0] and not k) for n, k in zip(new, kept, strict=True)]
-            return [*jaxprs.depends(cond, [*outside, *new]), *new]
-
-        of_goes_on, *of_carry = iterate.spread(
-            after, [varies(active), *_varying(operands[num_cond + num_body :])]
-        )
-        foreseen = Assumption([False, *carry.repeat(kept)], [of_goes_on, *carry.repeat(of_carry)])
-    loop = iterate.iterate(graph, step, [active, *start], active=0, foreseen=foreseen)
+        kept = [False, *carry.repeat(iterate.keeps(body, num_body, len(eqn.outvars)))]
+    loop = iterate.iterate(graph, step, [active, *start], active=0, kept=kept)
     return carry.pack(loop.results()[0][1:])
 
 
@@ -87,28 +76,16 @@ def scan_rule(graph: Graph, run: Callable, eqn: Equation, used: Any, *operands: 
     if length <= max(graph.scans, eqn.params["unroll"]):
         final, table = _unroll(step, carry.unpack(init), rows)
     else:
-        foreseen = None
+        kept = None
         if iterate.has_loops(body):
-            kept = iterate.keeps(body, num_consts, num_carry)
-            before, beside = _varying(consts), _varying(operands[split:])
-
-            def after(varying: list[bool]) -> list[bool]:
-                return jaxprs.depends(body, [*before, *varying, *beside])[:num_carry]
-
-            varying = iterate.spread(after, _varying(init))
-            foreseen = Assumption(carry.repeat(kept), carry.repeat(varying))
-        final, table = _as_loop(graph, step, carry.unpack(init), rows, length, foreseen)
+            kept = carry.repeat(iterate.keeps(body, num_consts, num_carry))
+        final, table = _as_loop(graph, step, carry.unpack(init), rows, length, kept)
     table = [table[k] for k in np.argsort(order)] if length else []
     stacked = [outs.pack(row) for row in table]
     ys = [np.stack(arrays.together(column)) for column in zip(*stacked, strict=True)]
     if not table:
         ys = [arrays.zeros(out.aval) for out in eqn.outvars[num_carry:]]
     return [*carry.pack(final), *ys]
-
-
-def _varying(operands: Sequence[Array]) -> list[bool]:
-    """Returns which arrays have elements that differ from lane to lane."""
-    return [any(map(varies, operand.flat)) for operand in operands]
 
 
 def _unroll(step: Iteration, state: list[Scalar], rows: list[list[Scalar]]) -> tuple[list, list]:
@@ -126,14 +103,14 @@ def _as_loop(
     inits: list,
     rows: list[list[Scalar]],
     length: int,
-    foreseen: Assumption | None,
+    kept: list[bool] | None,
 ) -> tuple[list, list]:
     """Builds a scan's loop; returns the final carry and the ys of each iteration."""
     xs = [list(column) for column in zip(*rows, strict=True)]
-    loop = iterate.iterate(graph, step, inits, length=length, xs=xs, foreseen=foreseen)
+    loop = iterate.iterate(graph, step, inits, length=length, xs=xs, kept=kept)
     switch = None if xs or loop.ys else _switch(loop)
     if switch is not None:
-        loop = iterate.iterate(graph, step, inits, length=length, active=switch, foreseen=foreseen)
+        loop = iterate.iterate(graph, step, inits, length=length, active=switch, kept=kept)
     final, columns = loop.results()
     return final, [list(row) for row in zip(*columns, strict=True)] or [[]] * length
 
