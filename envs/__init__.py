@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 silence_mjx()  # before any environment imports it
 
 _TASKS = "mjx_reinforce.envs.tasks"
-#: Arguments of ``make_vec`` that are no settings of the task.
-_OF_MAKE_VEC = ("num_envs", "autoreset", "max_episode_steps", "engine")
-
 #: id -> ("module:Class" or a callable, constructor arguments). One line a task.
 _TABLE: dict[str, tuple[str | Callable[..., Any], dict[str, Any]]] = {
     "InvertedPendulum-v5": (f"{_TASKS}.pendulums:InvertedPendulum", {}),
@@ -145,16 +142,9 @@ def make_vec(
     """
     from mjx_reinforce.engine.vector import environment  # loads JAX
 
-    try:
-        made = make(env, **settings) if isinstance(env, str) else env
-        if made is env and settings:
-            raise ValueError(f"{sorted(settings)} are for an id; this environment is made already")
-    except ValueError as error:
-        meant = [own for own in (checks.nearest(name, _OF_MAKE_VEC) for name in settings) if own]
-        if not meant:
-            raise
-        hint = f"make_vec itself takes {meant[0]!r}"
-        raise ValueError(f"{str(error).rstrip('.')}; {hint}") from error
+    made = make(env, **settings) if isinstance(env, str) else env
+    if made is env and settings:
+        raise ValueError(f"{sorted(settings)} are for an id; this environment is made already")
     options: Any = {"autoreset": autoreset, "max_episode_steps": max_episode_steps}
     return environment.make_vec(made, num_envs, engine=engine, **options)
 

@@ -63,9 +63,7 @@ def check_page(output: Path, overwrite: bool) -> None:
     """Raises ValueError if the report cannot be written there, or would replace files unasked."""
     check_output(output, overwrite, ".html", ".htm")
     beside = _beside(output)
-    if beside.exists() and not beside.is_dir():
-        raise ValueError(f"{beside} is in the way of the pictures; choose another --output")
-    if beside.is_dir() and any(beside.iterdir()) and not overwrite:
+    if beside.exists() and not overwrite:
         raise ValueError(f"{beside} exists; pass --overwrite or another --output")
 
 

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from mjx_reinforce.engine.base import MjModel, MjSpec
 #: Colors of a .gif, beside the one that is transparent.
 _COLORS = 255
-#: What MuJoCo's backends need that are not EGL.
-_NEEDS = {"glfw": "a screen", "osmesa": "the library OSMesa"}
 #: Pictures, spread over a film, whose colors it has.
 SAMPLES = 4
 
@@ -111,15 +109,10 @@ def import_mujoco() -> Any:
 
 def _no_drawing(error: Exception) -> ValueError:
     """Returns what is said where MuJoCo's own error would be, and what to do."""
-    chosen = os.environ.get("MUJOCO_GL", "").lower()
-    if chosen in _NEEDS:
-        return ValueError(
-            f"MUJOCO_GL={chosen} needs {_NEEDS[chosen]}, which is not here; set MUJOCO_GL=egl "
-            "(Debian: apt install libegl1)"
-        )
+    how = f"with MUJOCO_GL={chosen}" if (chosen := os.environ.get("MUJOCO_GL")) else "here"
     return ValueError(
-        f"MuJoCo cannot draw here ({error}); install EGL (Debian: apt install libegl1) "
-        "or set MUJOCO_GL to egl, osmesa or glfw, whichever this machine has"
+        f"MuJoCo cannot draw {how} ({error}); set MUJOCO_GL=egl, and install EGL if it is not here "
+        "(Debian: apt install libegl1)"
     )
 
 

@@ -58,15 +58,14 @@ def test_there_is_one_policy_of_a_task_by_its_name():
         load("HalfCheeta-v5")
 
 
-@pytest.mark.parametrize(("name", "needs"), [("GLFW", "a screen"), ("osmesa", "the library OSMe")])
-def test_a_renderer_that_is_not_here_is_answered_with_egl(monkeypatch, name, needs):
+def test_a_renderer_that_is_not_here_is_answered_with_egl(monkeypatch):
     def fail(*arguments):
         warnings.warn("GLFW is not initialized", UserWarning, stacklevel=1)
         raise RuntimeError("an OpenGL platform library has not been loaded")
 
-    monkeypatch.setenv("MUJOCO_GL", name)
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
     monkeypatch.setattr(mujoco, "Renderer", fail)
-    with pytest.raises(ValueError, match=f"={name.lower()} needs {needs}.* set MUJOCO_GL=egl "):
+    with pytest.raises(ValueError, match=r"=osmesa \(an OpenGL.* set MUJOCO_GL=egl,"):
         films.Renderer(envs.make("Hopper-v5").mj_model, 8, 8)
 
 
