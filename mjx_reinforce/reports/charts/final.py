@@ -55,7 +55,7 @@ def _rows(findings: Findings) -> charts.Spec:
     }
     tips = charts.tooltip(**{field: (name, ",.4~g") for field, name in said.items()})
     color = charts.series(findings.labels, legend=False)
-    scale = {"zero": False, "padding": 12}
+    scale = {"zero": False, "padding": 12, "nice": False}
     mean = charts.quantity("value", title="final return", scale=scale)
     y = {"axis": None, "scale": {"domain": [len(findings.results) - 0.4, -0.6]}}
     tenths = {"x": charts.quantity("tenth"), "x2": {"field": "ninetieth"}}
