@@ -70,19 +70,15 @@ def check_output(path: Path, overwrite: bool, *endings: str) -> None:
 
 
 def check_module(path: Path, example: str) -> None:
-    """Raises ValueError for a file that Python cannot import, or that hides another.
+    """Raises ValueError for a file that Python cannot import, or that hides another module.
 
     The message has the ``example`` of a better --output.
     """
-    if path.suffix != ".py" or not path.stem.isidentifier() or keyword.iskeyword(path.stem):
+    name, taken = path.stem, {"numpy", *sys.stdlib_module_names}
+    if path.suffix != ".py" or not name.isidentifier() or keyword.iskeyword(name) or name in taken:
         raise ValueError(
-            f"Python cannot import {path.name!r}; choose an --output of letters, digits and "
-            f"underscores, such as {example}"
-        )
-    if path.stem == "numpy" or path.stem in sys.stdlib_module_names:
-        raise ValueError(
-            f"{path.name} would hide Python's or NumPy's {path.stem} from all programs beside it; "
-            f"choose another --output, such as {example}"
+            f"Python cannot import {path.name!r} beside its own modules and NumPy; choose an "
+            f"--output of letters, digits and underscores, such as {example}"
         )
 
 

@@ -14,7 +14,7 @@ from mjx_reinforce.export.run_files import seeds_in
 from mjx_reinforce.files import check_output, csv_text, write_bytes
 from mjx_reinforce.reports import document, sources, words
 from mjx_reinforce.reports.charts import Table, render_chart, rows, short
-from mjx_reinforce.reports.document import Watch, encoded
+from mjx_reinforce.reports.document import encoded
 from mjx_reinforce.reports.experiment import Experiment, say
 from mjx_reinforce.reports.findings import Findings, compute_findings, swept, worst_seeds
 from mjx_reinforce.settings.config import env_flag
@@ -142,21 +142,19 @@ def table_csv(table: Table, labels: Sequence[str]) -> str:
     return csv_text([table, *(row.values() for row in rows(table, labels))])
 
 
-def how_to_watch(experiment: Experiment, findings: Findings) -> Watch:
-    """Returns how to see the worst seed of the best configuration: by what its directory kept."""
+def how_to_watch(experiment: Experiment, findings: Findings) -> str:
+    """Returns the command that shows the best configuration's worst seed, "" if none was kept."""
     best = findings.results[0]
-    worst, own = worst_seeds(best)[0], env_flag(experiment.env)
+    worst = worst_seeds(best)[0]
     seed, place = int(best.configuration.seed[worst]), best.configuration.where[worst]
-    said = f"To watch the worst, seed {seed}:"
     if not (place / "config.json").is_file():  # a sweep
         first = experiment.directories[findings.order[0]]
         number = findings.order[0] - experiment.directories.index(first)
         place = place / "policies" / f"{number:03d}"
         if seed not in seeds_in(place):
-            return Watch(f"The worst is seed {seed}, whose policy was not kept.", "")
-        said = f"{said[:-1]}, whose policy the sweep kept:"
-    command = f"python -m mjx_reinforce.watch {shlex.quote(str(place))} --seed {seed}{own}"
-    return Watch(said, command)
+            return ""
+    run = f"{shlex.quote(str(place))} --seed {seed}{env_flag(experiment.env)}"
+    return f"python -m mjx_reinforce.watch {run}"
 
 
 if __name__ == "__main__":

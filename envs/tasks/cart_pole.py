@@ -13,14 +13,13 @@ import numpy as np
 from flax import struct
 
 from mjx_reinforce.engine.base import Box, Discrete
-from mjx_reinforce.engine.checks import changed_fields, check_name
+from mjx_reinforce.engine.checks import changed_fields
 from mjx_reinforce.envs.base import Env, State
 from mjx_reinforce.envs.settings import EpisodeSettings, build_settings
 
 _GRAVITY, _CART_MASS, _POLE_MASS, _HALF_LENGTH = 9.8, 1.0, 0.1, 0.5
 _TIMESTEP, _FORCE = 0.02, 10.0
 _MAX_POSITION, _START_NOISE = 2.4, 0.05
-_INTEGRATORS = ("euler", "semi-implicit euler")
 
 
 @struct.dataclass(kw_only=True)
@@ -38,19 +37,7 @@ class Motion:
 class Cart(Env):
     """A cart on a rail with a pole on it; tasks define ``action_space`` and ``step``."""
 
-    @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Settings(EpisodeSettings):
-        """Arguments of every cart."""
-
-        kinematics_integrator: str = "euler"
-        """"euler" moves with the old velocity, "semi-implicit euler" with the new one."""
-
-        def __post_init__(self):
-            """Raises ValueError for a value that is out of its range."""
-            super().__post_init__()
-            check_name("integrator", self.kinematics_integrator, dict.fromkeys(_INTEGRATORS))
-
-    settings: Settings
+    settings: EpisodeSettings
 
     dt, frame_skip = _TIMESTEP, 1
     #: The model that shows ``qpos`` in pictures and videos; the dynamics do not use it.
@@ -115,8 +102,7 @@ class Cart(Env):
         motion = cast(Motion, state.pipeline_state)
         qacc = _acceleration(motion, force)
         qvel = motion.qvel + _TIMESTEP * qacc
-        explicit = self.settings.kinematics_integrator == "euler"
-        qpos = motion.qpos + _TIMESTEP * (motion.qvel if explicit else qvel)
+        qpos = motion.qpos + _TIMESTEP * motion.qvel
         lost = jnp.any(jnp.abs(qpos) > jnp.array([_MAX_POSITION, self.max_angle], qpos.dtype))
         reward = jnp.where(lost, reward_lost, reward_up).astype(qpos.dtype)
         return _state(qpos, qvel, reward, lost.astype(qpos.dtype), state)
@@ -134,7 +120,7 @@ class CartPole(Cart):
     """
 
     @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Settings(Cart.Settings):
+    class Settings(EpisodeSettings):
         """Arguments of CartPole."""
 
         max_episode_steps: int = 500
@@ -166,7 +152,7 @@ class ContinuousCartPole(Cart):
     """
 
     @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Settings(Cart.Settings):
+    class Settings(EpisodeSettings):
         """Arguments of ContinuousCartPole."""
 
         max_episode_steps: int = 50

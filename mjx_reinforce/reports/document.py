@@ -5,7 +5,7 @@ import json
 import math
 from collections.abc import Mapping
 from importlib import resources
-from typing import Any, NamedTuple
+from typing import Any
 
 import jinja2
 from markupsafe import Markup
@@ -20,13 +20,6 @@ from mjx_reinforce.reports.words import steps
 #: The charts in the order of the page.
 _CHARTS = (final, curves, solved, distribution, profile, sensitivity)
 _TEMPLATES = resources.files("mjx_reinforce.reports") / "files"
-
-
-class Watch(NamedTuple):
-    """How to see a seed for oneself: what to do, and the command."""
-
-    said: str
-    command: str
 
 
 def draw_charts(findings: Findings) -> list[charts.Chart]:
@@ -44,7 +37,7 @@ def render(
     findings: Findings,
     drawn: list[charts.Chart],
     results: str,
-    watch: Watch,
+    watch: str,
     version: str,
     seconds: float,
 ) -> str:
@@ -54,7 +47,7 @@ def render(
       findings: the figures.
       drawn: its charts.
       results: ``results.csv``.
-      watch: how to see the worst seed.
+      watch: the command that shows the worst seed, if its policy was kept.
       version: of this program.
       seconds: how long the report has taken so far.
     """

@@ -109,7 +109,7 @@ def test_a_walker_starts_in_its_key_frame(tmp_path, monkeypatch):
 WRONG = {
     "nothing.xml": "there is no model",
     "model.urdf": "model.urdf is no model; give an MJCF file that ends in .xml",
-    "arm.xml --output json.py": "json.py would hide Python's or NumPy's json",
+    "arm.xml --output json.py": "cannot import 'json.py' beside",
     "arm.xml --output my-arm.py": "Python cannot import 'my-arm.py'",
     "arm.xml --output ../arm.py": "must be in the folder of arm.xml",
     "arm.xml --output there.py": "there.py exists; pass --overwrite",
