@@ -8,7 +8,7 @@ import numpy as np
 from jax import lax
 
 from mjx_reinforce.engine import scalar
-from mjx_reinforce.engine.scalar import evaluate, jaxprs
+from mjx_reinforce.engine.scalar import jaxprs, scalarized
 from mjx_reinforce.engine.scalar.graph import Graph
 
 BATCH = 6
@@ -51,7 +51,7 @@ def folded(fn, *args):
     arrays = [np.asarray(x) for x in args]
     program, _ = jaxprs.trace(fn, *arrays)
     with np.errstate(all="ignore"):  # as ``scalarize`` has it
-        results = evaluate.run(Graph(400, 4), program, arrays)
+        results = scalarized.run(Graph(400, 4), program, arrays)
     assert all(result.dtype != object for result in results)
     return results
 

@@ -175,7 +175,7 @@ def launch_map(
     """Runs a kernel that maps a function; vmapped, it remains one launch.
 
     Args:
-      kernel: of ``mapping.mapping_text``.
+      kernel: of ``kernel.mapping_text``.
       results: shape [N, ...] and dtype of what it returns.
       args: its arguments [N, ...].
     """

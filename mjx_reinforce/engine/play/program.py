@@ -12,10 +12,10 @@ from jax import lax
 
 from mjx_reinforce.engine import base, scalar
 from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, observation_size
-from mjx_reinforce.engine.cpu import handler, kernel, machine, mapping
+from mjx_reinforce.engine.cpu import handler, kernel, machine
 from mjx_reinforce.engine.cpu import seam as cpu_seam
 from mjx_reinforce.engine.gpu import kernel as gpu_kernel
-from mjx_reinforce.engine.gpu import lockstep, ptx
+from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.gpu import seam as gpu_seam
 from mjx_reinforce.engine.play import available, episode, objects
 from mjx_reinforce.engine.play.counter import at_counter, split
@@ -209,7 +209,7 @@ def load(
 
     def write() -> str:
         written = _written(traced, shapes, 0 if env is None else observation_size(env))
-        title = f"; {name}, {lockstep.operations(written.schedule):,} scalar operations\n"
+        title = f"; {name}, {sum(written.operations.values()):,} scalar operations\n"
         return title + (writers.cpu(written, target) if target else writers.gpu(written))
 
     if target:
@@ -316,8 +316,8 @@ def _write_cpu(written: scalarized.Scalarized, target: machine.Machine) -> str:
     """Writes a function, and all around it, as LLVM IR."""
     num_args = 1 + sum(bool(np.prod(x.shape)) for x in written.in_avals)
     sizes = [np.dtype(x.dtype).itemsize for x in written.out_avals if np.prod(x.shape)]
-    entry = handler.handler_text(num_args, sizes, target.lanes, mapping.POSITIONS, zeroed=False)
-    return entry + handler.flush(target.triple) + mapping.mapping_text(written, target.lanes)
+    entry = handler.handler_text(num_args, sizes, target.lanes, kernel.MAPPED, zeroed=False)
+    return entry + handler.flush(target.triple) + kernel.mapping_text(written, target.lanes)
 
 
 def name_of(env: Any) -> str:

@@ -16,7 +16,7 @@ from toys import Busy, Bytes, Chain, Drifting, categorical
 from mjx_reinforce import Box, make_vec
 from mjx_reinforce.engine import scalar
 from mjx_reinforce.engine.gpu import kernel as kernels
-from mjx_reinforce.engine.gpu import lockstep, ptx, seam
+from mjx_reinforce.engine.gpu import ptx, seam
 from mjx_reinforce.engine.physics import touching
 from mjx_reinforce.engine.play import available, choice, native, program, rollouts
 from mjx_reinforce.engine.scalar import scalarized
@@ -65,7 +65,7 @@ def test_the_same_episodes_as_everywhere(env, distribution, monkeypatch):
 @pytest.mark.slow
 def test_episodes_that_are_not_active_are_not_played(busy, monkeypatch):
     """Also in step with others: a thread that never had an episode counts no steps."""
-    monkeypatch.setattr(lockstep, "LONG", 0)
+    monkeypatch.setattr(kernels, "LONG", 0)
     chosen = np.array([[0] * 5, [0, 1, 0, 0, 1], [0] * 5]).astype(bool)
     options = {"horizon": 20, "deterministic": jnp.arange(5) % 2 == 1}
     for threads in (1, 3):
@@ -90,7 +90,7 @@ def test_in_step_or_apart_an_episode_is_the_same(busy, monkeypatch):
     for long in (10**9, 4, 0):
         block = gpu_on_cpu.Block(3)
         gpu_on_cpu.emulate(monkeypatch, block=block)
-        monkeypatch.setattr(lockstep, "LONG", long)
+        monkeypatch.setattr(kernels, "LONG", long)
         got = played(native.rollout, *busy, horizon=30)
         assert block.apart is None
         meetings.append(block.meetings)
@@ -110,7 +110,7 @@ def test_threads_meet_where_some_have_no_room_for_their_contacts(monkeypatch):
     assert {0, 1, 2} <= {*touch.ravel().astype(int)}
     block = gpu_on_cpu.Block(3)
     gpu_on_cpu.emulate(monkeypatch, block=block)
-    monkeypatch.setattr(lockstep, "LONG", 0)
+    monkeypatch.setattr(kernels, "LONG", 0)
     assert_identical(played(native.rollout, env, who, **size), want)
     assert block.apart is None
 
@@ -136,7 +136,7 @@ def test_ptx(busy, long, tmp_path, monkeypatch):
     """It is one kernel that calls nothing; NVIDIA's assembler takes it, where there is one."""
     env, player = busy
     if long:
-        monkeypatch.setattr(lockstep, "LONG", 4)
+        monkeypatch.setattr(kernels, "LONG", 4)
     text = kernel_text(env, *player)
     for capability in ("7.5", "9.0"):
         made = ptx.load_kernel(text, lambda: text, capability, tmp_path)
