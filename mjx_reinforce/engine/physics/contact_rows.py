@@ -10,8 +10,9 @@ fewer vectors, with which machine code computes. And it leaves out the degrees o
 contact can couple, such as two legs of Ant, of which each touches the floor alone.
 """
 
+import functools
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -116,19 +117,24 @@ def with_bases(division: Blocks, rows: jax.Array, touching: jax.Array) -> Jacobi
     if not is_written_out():
         return Jacobian(rows, [])
 
-    def of_group(group: Group, edges: jax.Array, touching: jax.Array) -> jax.Array:
-        pyramid = group.pyramid
-        inverse = jnp.asarray(pyramid.T / np.sum(pyramid**2, 0)[:, None], rows.dtype)
+    bases, parts = [], (by_group(division, rows), _of_groups(division, touching))
+    for group, *each in zip(division.groups, *parts, strict=True):
+        inverse = group.pyramid.T / np.sum(group.pyramid**2, 0)[:, None]
+        basis = functools.partial(jnp.matmul, jnp.asarray(inverse, rows.dtype))
+        bases.append(_of_touching(basis, *each))
+    return Jacobian(rows, bases)
 
-        def basis(_: None, one: tuple) -> tuple[None, jax.Array]:
-            edges, touches = one
-            zeros = jnp.zeros((len(inverse), edges.shape[1]), edges.dtype)
-            return None, skippable(touches, lambda: inverse @ edges, zeros)
 
-        return short_scan(basis, None, (edges, touching))[1]
+def _of_touching(function: Callable, rows: jax.Array, touching: jax.Array) -> jax.Array:
+    """Returns a function of the rows of each contact that touches; zeros for the others."""
 
-    parts = by_group(division, rows), _of_groups(division, touching)
-    return Jacobian(rows, [of_group(*each) for each in zip(division.groups, *parts, strict=True)])
+    def of_one(_: None, one: tuple) -> tuple[None, jax.Array]:
+        rows, touches = one
+        made = jax.eval_shape(function, rows)
+        zeros = jnp.zeros(made.shape, made.dtype)
+        return None, skippable(touches, lambda: function(rows), zeros)
+
+    return short_scan(of_one, None, (rows, touching))[1]
 
 
 def weighted(
@@ -186,19 +192,13 @@ def along(
     if not is_written_out():
         return jacobian.rows @ direction
 
-    def of_group(group: Group, basis: jax.Array, touching: jax.Array) -> jax.Array:
+    products = [jacobian.rows[: division.others] @ direction]
+    parts = jacobian.bases, _of_groups(division, touching)
+    for group, *each in zip(division.groups, *parts, strict=True):
         pyramid = jnp.asarray(group.pyramid, direction.dtype)
-
-        def product(_: None, one: tuple) -> tuple[None, jax.Array]:
-            basis, touches = one
-            zeros = jnp.zeros(len(pyramid), pyramid.dtype)
-            return None, skippable(touches, lambda: pyramid @ (basis @ direction), zeros)
-
-        return short_scan(product, None, (basis, touching))[1].reshape(-1)
-
-    others, parts = jacobian.rows[: division.others], _of_groups(division, touching)
-    each = zip(division.groups, jacobian.bases, parts, strict=True)
-    return jnp.concatenate([others @ direction, *(of_group(*one) for one in each)])
+        product = lambda basis, pyramid=pyramid: pyramid @ (basis @ direction)  # noqa: E731
+        products.append(_of_touching(product, *each).reshape(-1))
+    return jnp.concatenate(products)
 
 
 def _plus_product(start: jax.Array, left: jax.Array, right: jax.Array) -> jax.Array:

@@ -12,6 +12,7 @@ from jax import lax
 
 from mjx_reinforce.engine import base, scalar
 from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, observation_size
+from mjx_reinforce.engine.checks import explain
 from mjx_reinforce.engine.cpu import handler, kernel, machine
 from mjx_reinforce.engine.cpu import seam as cpu_seam
 from mjx_reinforce.engine.gpu import kernel as gpu_kernel
@@ -328,11 +329,12 @@ def name_of(env: Any) -> str:
 
 def refusal(error: Exception) -> str:
     """Returns in one line why machine code cannot be made, from what was raised."""
-    if isinstance(error, TypeError):
-        return " ".join(str(error).split())
+    said = " ".join(str(error).split())
+    if isinstance(error, (TypeError, scalar.TooLarge, scalar.UnsupportedPrimitive)):
+        return said
     if type(error) is RuntimeError:
-        return f"LLVM refuses its program: {' '.join(str(error).split())}"
-    return scalar.refusal(error)
+        return f"LLVM refuses its program: {said}"
+    return f"it cannot be written out ({explain(error)})"
 
 
 def while_running(function: Callable[..., StepResult]) -> Any:

@@ -48,7 +48,6 @@ from mjx_reinforce.engine.scalar.primitives import skippable as skippable
 from mjx_reinforce.engine.scalar.primitives import whole as whole
 from mjx_reinforce.engine.scalar.primitives import writing_out as writing_out
 from mjx_reinforce.engine.scalar.scalarized import Scalarized as Scalarized
-from mjx_reinforce.engine.scalar.scalarized import refusal as refusal
 from mjx_reinforce.engine.scalar.scalarized import scalarize as scalarize
 from mjx_reinforce.engine.scalar.size import TooLarge as TooLarge
 from mjx_reinforce.engine.scalar.vmap import vmap as vmap

@@ -10,7 +10,6 @@ import jax
 import numpy as np
 
 from mjx_reinforce.engine.base import PyTree, is_key
-from mjx_reinforce.engine.checks import explain
 from mjx_reinforce.engine.scalar import arrays, jaxprs, size
 from mjx_reinforce.engine.scalar.backend import Backend
 from mjx_reinforce.engine.scalar.graph import Graph
@@ -202,10 +201,3 @@ def _word_by_word(graph: Graph, eqn: jaxprs.Equation, operands: list[np.ndarray]
         plane = [x[..., k] if key else x for x, key in zip(operands, keys, strict=True)]
         planes.append(rule(graph, one, *plane))
     return [np.stack(arrays.together(words), -1) for words in zip(*planes, strict=True)]
-
-
-def refusal(error: Exception) -> str:
-    """Returns in one line why a function cannot be written out, from what was raised."""
-    if isinstance(error, (size.TooLarge, jaxprs.UnsupportedPrimitive)):
-        return " ".join(str(error).split())
-    return f"it cannot be written out ({explain(error)})"
