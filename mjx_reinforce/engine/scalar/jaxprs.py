@@ -162,7 +162,7 @@ def words(atom: Atom) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(shape, dtype)
 
 
-def on_words(eqn: Equation) -> Equation:
+def on_words(eqn: Any) -> Equation:
     """Returns an equation that moves keys as one that moves a word of each."""
 
     def word(atom: Atom) -> Any:
@@ -170,14 +170,7 @@ def on_words(eqn: Equation) -> Equation:
             return atom
         return SimpleNamespace(aval=jax.ShapeDtypeStruct(atom.aval.shape, np.dtype(np.uint32)))
 
-    one: Any = SimpleNamespace(
-        primitive=eqn.primitive,
-        params=eqn.params,
-        invars=list(map(word, eqn.invars)),
-        outvars=list(map(word, eqn.outvars)),
-        source_info=eqn.source_info,
-    )
-    return one
+    return eqn.replace(invars=[*map(word, eqn.invars)], outvars=[*map(word, eqn.outvars)])
 
 
 def _implementation(key: Atom) -> Any:

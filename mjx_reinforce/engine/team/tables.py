@@ -357,14 +357,15 @@ class _Tables:
         self.ints["dof_limited"] = limited
         bounds = [*m.jnt_range[joint].T, m.jnt_margin[joint], m.dof_invweight0]
         self.reals["dof_limit"] = np.stack(bounds, 1)
-        self.ints["dof_limit_soft"] = [
-            self._soft(m.jnt_solref[j], m.jnt_solimp[j]) if x else 0
-            for j, x in zip(joint, limited, strict=True)
-        ]
+        refs, imps = m.jnt_solref[joint], m.jnt_solimp[joint]
+        self.ints["dof_limit_soft"] = self._softs(refs, imps, limited)
         self.reals["dof_loss"] = np.stack([m.dof_frictionloss, m.dof_invweight0], 1)
-        self.ints["dof_loss_soft"] = [
-            self._soft(m.dof_solref[i], m.dof_solimp[i]) if m.dof_frictionloss[i] else 0
-            for i in range(m.nv)
+        self.ints["dof_loss_soft"] = self._softs(m.dof_solref, m.dof_solimp, m.dof_frictionloss)
+
+    def _softs(self, refs: np.ndarray, imps: np.ndarray, used: np.ndarray) -> list[int]:
+        """Returns ``_soft`` of each row that is used, 0 for the others."""
+        return [
+            self._soft(*x) if is_used else 0 for *x, is_used in zip(refs, imps, used, strict=True)
         ]
 
     def _soft(self, solref: np.ndarray, solimp: np.ndarray) -> int:
@@ -504,17 +505,14 @@ class _Tables:
             soft = self._soft(m.pair_solref[n], m.pair_solimp[n])
             return int(m.pair_dim[n]), float(m.pair_margin[n]), m.pair_friction[n], soft
         priority = m.geom_priority[geoms]
-        first = priority[0] > priority[1]
         if priority[0] != priority[1]:
-            one = g if first else h
+            one = geoms[priority.argmax()]
             dim, friction = m.geom_condim[one], m.geom_friction[one]
             ref, imp = m.geom_solref[one], m.geom_solimp[one]
         else:
             dim, friction = m.geom_condim[geoms].max(), m.geom_friction[geoms].max(0)
-            mix = m.geom_solmix[geoms]
-            small = mix < _TINY
-            share = 0.5 if small.all() else 0.0 if small[0] else 1.0
-            share = share if small.any() else mix[0] / mix.sum()
+            mix = np.where(m.geom_solmix[geoms] < _TINY, 0, m.geom_solmix[geoms])
+            share = mix[0] / mix.sum() if mix.any() else 0.5
             refs, imps = m.geom_solref[geoms], m.geom_solimp[geoms]
             direct = (refs[:, 0] <= 0).any()
             ref = refs.min(0) if direct else share * refs[0] + (1 - share) * refs[1]
