@@ -17,7 +17,7 @@ from mjx_reinforce.reports.charts import Table, render_chart, rows, short
 from mjx_reinforce.reports.document import encoded
 from mjx_reinforce.reports.experiment import Experiment, say
 from mjx_reinforce.reports.findings import Findings, compute_findings, swept, worst_seeds
-from mjx_reinforce.settings.config import env_flag
+from mjx_reinforce.settings.config import code_flags
 from mjx_reinforce.settings.flags import run_command
 from mjx_reinforce.store.provenance import version
 
@@ -153,7 +153,8 @@ def how_to_watch(experiment: Experiment, findings: Findings) -> str:
         place = place / "policies" / f"{number:03d}"
         if seed not in seeds_in(place):
             return ""
-    run = f"{shlex.quote(str(place))} --seed {seed}{env_flag(experiment.env)}"
+    own = code_flags({"env": experiment.env})
+    run = f"{shlex.quote(str(place))} --seed {seed}{own}"
     return f"python -m mjx_reinforce.watch {run}"
 
 

@@ -22,39 +22,23 @@ _FIRST = (".config.json.", ".sweep.json.")
 _ROOM = 2**20
 
 
-def make_directory(directory: Path) -> list[Path]:
-    """Makes the run directory.
-
-    Returns:
-      The folders that were made, the innermost first.
+def _make(directory: Path) -> None:
+    """Makes the directory of a run, or raises OSError.
 
     Raises:
-      ValueError: it exists and is not empty, is no directory, is in that of another run, or
-        cannot be written.
+      ValueError: it is not empty, or is in that of another run.
     """
-    made: list[Path] = []
-    try:
-        if (outer := _run_around(directory)) is not None:
-            raise ValueError(
-                f"the run directory {directory} would be inside the run {outer}; choose another "
-                "--output"
-            )
-        made = [folder for folder in (directory, *directory.parents) if not folder.exists()]
-        directory.mkdir(parents=True, exist_ok=True)
-        # Where a run was killed as it wrote its first file, nothing was begun.
-        names = [path.name for path in directory.iterdir()]
-        if any(not name.startswith(_FIRST) for name in names):
-            raise ValueError(
-                f"the run directory {directory} is not empty; choose another --output, or delete it"
-            )
-        _try_to_write(directory)
-    except OSError as error:
-        remove_empty(made)
+    if (outer := _run_around(directory)) is not None:
         raise ValueError(
-            f"cannot write to the run directory {directory} ({error.strerror}); "
-            "make room there, or choose another --output"
-        ) from error
-    return made
+            f"the run directory {directory} would be inside the run {outer}; choose another "
+            "--output"
+        )
+    directory.mkdir(parents=True, exist_ok=True)
+    # Where a run was killed as it wrote its first file, nothing was begun.
+    if any(not path.name.startswith(_FIRST) for path in directory.iterdir()):
+        raise ValueError(
+            f"the run directory {directory} is not empty; choose another --output, or delete it"
+        )
 
 
 def _run_around(directory: Path) -> Path | None:
@@ -64,16 +48,6 @@ def _run_around(directory: Path) -> Path | None:
         if run or (parent / "sweep.json").exists():
             return parent
     return None
-
-
-def check_writable(directory: Path) -> None:
-    """Raises ValueError if the run in a directory cannot go on there."""
-    try:
-        _try_to_write(directory)
-    except OSError as error:
-        raise ValueError(
-            f"cannot write to the run directory {directory} ({error.strerror}); make room there"
-        ) from error
 
 
 def _try_to_write(directory: Path) -> None:
@@ -101,13 +75,21 @@ def own_directory(directory: Path, interrupt: Interrupt, *, resumed: bool) -> It
       resumed: whether it goes on there.
 
     Raises:
-      ValueError: see ``make_directory``, ``check_writable`` and ``locked``.
+      ValueError: it is not empty, is in that of another run, cannot be written, or is another
+        process's.
     """
     made: list[Path] = []
-    if resumed:
-        check_writable(directory)
-    else:
-        made = make_directory(directory)
+    try:
+        made = [folder for folder in (directory, *directory.parents) if not folder.exists()]
+        if not resumed:
+            _make(directory)
+        _try_to_write(directory)
+    except OSError as error:
+        remove_empty(made)
+        raise ValueError(
+            f"cannot write to the run directory {directory} ({error.strerror}); make room there, "
+            "or choose another --output"
+        ) from error
     with locked(directory):  # a folder in which another trains stays
         interrupt.on_exit(lambda: remove_empty(made))
         try:

@@ -17,7 +17,7 @@ from rich.text import Text
 
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.streams import heartbeat
-from mjx_reinforce.settings.config import env_flag
+from mjx_reinforce.settings.config import code_flags
 from mjx_reinforce.statistics import enough, iqm
 from mjx_reinforce.training import record
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer
@@ -95,7 +95,7 @@ class Display(Observer[Driver]):
     def show_summary(self, summary: dict[str, Any], directory: Path) -> None:
         """Says what a run learned, where its files are, and what can be done with them."""
         self.say(summary_table(summary))
-        own = env_flag(summary["env"])
+        own = code_flags({"env": summary["env"]})
         if summary["status"] == "interrupted":
             self.say(f"Interrupted: go on with --resume {directory}{own}", whole=True)
             return

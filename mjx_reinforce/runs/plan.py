@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from mjx_reinforce import envs
 from mjx_reinforce.engine.base import Environment
 from mjx_reinforce.engine.memory import host_memory
 from mjx_reinforce.registry import is_own
@@ -22,7 +21,7 @@ from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.defaults import num_cores
 from mjx_reinforce.settings.groups import Reader
 from mjx_reinforce.store.provenance import provenance
-from mjx_reinforce.store.ready import Ready, get_ready, made
+from mjx_reinforce.store.ready import Ready, get_ready
 from mjx_reinforce.training import resume
 from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.division import Division, divide_run
@@ -113,7 +112,7 @@ def prepare(
     if design.over:
         return Prepared(design, *_prepare_sweep(design, known), known, None, clock)
     config, division, found = design.base, divide_run(design.base), None
-    ready = get_ready(config, design.default or config, env)
+    ready = get_ready(config, design.default or config, env, division)
     if config.resume is not None:
         found = _find(config, say)
     if config.init_from is not None and found is None:
@@ -156,8 +155,8 @@ def _prepare_sweep(design: Design, known: Mapping[str, Any]) -> tuple[list[Part]
         )
     parts = []
     for number, group in enumerate(make_groups(design)):
-        env = envs.make_set(group.config.env, group.config.env_set)
-        ready = made(env, group.config, division, tuple(group.settings))
+        config, traced = group.config, tuple(group.settings)
+        ready = get_ready(config, config, division=division, traced=traced)
         part, limit = Part(group, ready, 0, 0, []), design.chunk_runs
         if known:
             limit = known["chunk_runs"][number]

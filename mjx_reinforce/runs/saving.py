@@ -356,7 +356,8 @@ class SweepFiles(Files[Training]):
         """
         last = {
             name.removeprefix("ends/"): np.concatenate([chunk[name] for chunk in chunks])
-            for name in chunks[0].keys() - _CURVES.keys()
+            for name in chunks[0]
+            if name not in _CURVES
         }
         policy = part.ready.policy
         for number in part.group.members.tolist():

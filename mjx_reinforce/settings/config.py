@@ -250,11 +250,6 @@ def code_flags(settings: Mapping[str, Any]) -> str:
     return "".join(f" --{name} {shlex.quote(value)}" for name, value in own.items())
 
 
-def env_flag(env: str) -> str:
-    """Returns ``code_flags`` of an environment alone."""
-    return code_flags({"env": env})
-
-
 def check_named(
     settings: Mapping[str, Any], named: Mapping[str, str | None], directory: Path
 ) -> None:

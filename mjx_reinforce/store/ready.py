@@ -34,22 +34,31 @@ class Ready(NamedTuple):
     programs: Callable[[], Programs]
 
 
-def get_ready(config: Config, default: Config, env: Environment | None = None) -> Ready:
-    """Returns what the settings come to; from disk, if they did before.
+def get_ready(
+    config: Config,
+    default: Config,
+    env: Environment | None = None,
+    division: Division | None = None,
+    traced: Collection[str] | None = None,
+) -> Ready:
+    """Returns what the settings come to; those of a run from disk, if they did before.
 
     Args:
       config: the settings.
       default: those that hold where the user gave none.
       env: the environment; by default the one that the settings name, built if it is needed.
+      division: see ``made``.
+      traced: see ``made``.
 
     Raises:
       ValueError: the settings do not fit the environment.
     """
-    key = kept.key_of(config)
-    ready = None if key is None else _found(key, config)
+    division = division or divide_run(config)
+    key = kept.key_of(config) if traced is None else None
+    ready = None if key is None else _found(key, config, division)
     if ready is None:
         built = envs.make_set(config.env, config.env_set) if env is None else env
-        ready = made(built, config)
+        ready = made(built, config, division, traced)
         if key is not None:
             facts = ready._asdict()
             del facts["programs"]
@@ -60,7 +69,7 @@ def get_ready(config: Config, default: Config, env: Environment | None = None) -
     return ready
 
 
-def _found(key: str, config: Config) -> Ready | None:
+def _found(key: str, config: Config, division: Division) -> Ready | None:
     """Returns what is on disk of the settings; None if nothing is."""
     found = kept.read_programs(key)
     if found is None and config.resume is not None:
@@ -72,7 +81,7 @@ def _found(key: str, config: Config) -> Ready | None:
     if found is None:
         return None
     facts, programs = found
-    programs = programs._replace(division=divide_run(config))
+    programs = programs._replace(division=division)
     return Ready(**facts, programs=lambda: programs)
 
 
@@ -94,8 +103,7 @@ def made(
     Raises:
       ValueError: the settings do not fit the environment.
     """
-    if division is None:
-        division = divide_run(config)
+    division = division or divide_run(config)
     devices = division.devices() if division.episodes > 1 else None
     learner, horizon = build(env, config, devices=devices)
     threshold = getattr(env, "reward_threshold", None)

@@ -120,14 +120,10 @@ def test_a_run_is_not_put_into_another(run, tmp_path, capsys, files):
     assert not (tmp_path / "new").exists()
 
 
-MEMORY = RuntimeError("RESOURCE_EXHAUSTED: 9 GB")
+LOWER = "; lower --num-seeds, --num-episodes, --eval-episodes or --horizon"
 FULL = [
-    (
-        MEMORY,
-        2,
-        "this run does not fit into memory (RESOURCE_EXHAUSTED: 9 GB); lower --num-seeds, "
-        "--num-episodes, --eval-episodes or --horizon",
-    ),
+    (RuntimeError("RESOURCE_EXHAUSTED"), 2, f"fit into memory (RESOURCE_EXHAUSTED){LOWER}"),
+    (MemoryError("9 GB"), 2, f"this run does not fit into memory (9 GB){LOWER}"),
     (
         OSError(errno.ENOSPC, "No space left"),
         1,
@@ -156,6 +152,11 @@ def test_what_is_full_is_said_in_one_line(failing, tmp_path, capsys, error, stat
     assert failing(error) == status
     assert " ".join(capsys.readouterr().err.split()).endswith(said)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_mistake_of_ours_in_training_is_no_bad_input(failing):
+    with pytest.raises(ValueError, match="a bug"):
+        failing(ValueError("a bug"))
 
 
 def test_another_error_is_not_said_to_be_of_memory(failing):

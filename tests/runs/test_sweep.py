@@ -319,6 +319,7 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
     assert run("--resume parts") == 0  # killed before the report was written
     assert reported == [Path("parts")]
     Path("parts/report.html").touch()
+    monkeypatch.setattr("mjx_reinforce.runs.perform.configure_jax", pytest.fail)
     assert run("--resume parts") == 0  # there is nothing left to do
     assert reported == [Path("parts")]
     assert run("--resume parts --learning-rate 0.5") == 2

@@ -20,7 +20,7 @@ from mjx_reinforce import files
 from mjx_reinforce import files as export_files
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.runs import plan
-from mjx_reinforce.runs.directory import locked, make_directory
+from mjx_reinforce.runs.directory import locked
 from mjx_reinforce.runs.saving import RunFiles
 from mjx_reinforce.training import checkpoint
 from mjx_reinforce.training.slots import Slots
@@ -292,11 +292,6 @@ def test_the_folder_of_a_run_that_begins_elsewhere_stays(run, tmp_path, monkeypa
         assert run("--output", "out/in") == 2
     assert "another process trains in out/in" in capsys.readouterr().err
     assert (tmp_path / "out" / "in").is_dir()
-
-
-def test_the_folders_that_were_made_are_known(tmp_path):
-    assert make_directory(tmp_path / "c" / "d") == [tmp_path / "c" / "d", tmp_path / "c"]
-    assert make_directory(tmp_path / "c" / "d") == []
 
 
 def test_a_finished_run_has_nothing_to_do(run, trained, tmp_path, capsys):
