@@ -301,11 +301,6 @@ class MujocoEnv(Env):
         return Physics(**_carried(data), carried=kept, episode=episode)
 
     @property
-    def num_contacts(self) -> int:
-        """The most contacts that the model can have at once."""
-        return mjx_internals.num_contacts(models.make_data(self.mj_model))
-
-    @property
     def dt(self) -> float:
         """The duration of one env step (s)."""
         return self.frame_skip * self.mj_model.opt.timestep

@@ -11,13 +11,7 @@ import numpy as np
 from mjx_reinforce.reports.experiment import Configuration, Experiment
 from mjx_reinforce.statistics import Estimate, iqm, iqm_interval
 from mjx_reinforce.statistics.aggregates import cvar, estimate_mean, wilson
-from mjx_reinforce.statistics.comparisons import (
-    Comparison,
-    compare_all,
-    holm,
-    seeds_needed,
-    wrong_winner,
-)
+from mjx_reinforce.statistics.comparisons import Comparison, compare_all, holm
 from mjx_reinforce.statistics.survival import (
     collapses,
     log_rank,
@@ -35,8 +29,6 @@ _GRID_POINTS = 60
 _SAME_BUDGET = 0.9
 #: How many of the worst seeds are named, and what share of all, at most.
 _WORST, _WORST_SHARE = 10, 0.25
-#: Seeds with which people compare, and of which the page says how often they err.
-FEW = (3, 5, 10)
 
 
 class Solving(NamedTuple):
@@ -86,17 +78,6 @@ class Result(NamedTuple):
     solving: Solving | None
 
 
-class Few(NamedTuple):
-    """What a comparison of the two best with few seeds would have said.
-
-    wrong: how often the mean of so many seeds names the other one, by the number of seeds
-    needed: seeds of each with which a test finds the difference four times out of five, if any do
-    """
-
-    wrong: dict[int, float]
-    needed: int | None
-
-
 class Findings(NamedTuple):
     """All figures of a report.
 
@@ -113,7 +94,6 @@ class Findings(NamedTuple):
     order: list[int]
     grid: np.ndarray
     comparisons: list[Comparison]
-    few: Few | None
     speeds: dict[tuple[int, int], float]
     until: int
 
@@ -129,16 +109,11 @@ def compute_findings(experiment: Experiment) -> Findings:
     ends = [int(part.env_steps[-1].min()) for part in parts]
     # A seed stops after the update that reaches its budget, so that ends differ a little.
     grid = _curve_steps(parts, min(end for end in ends if end >= _SAME_BUDGET * max(ends)))
-    curves = [
-        np.where((grid <= end)[:, None], on_grid(grid, part.env_steps, part.eval_return), np.nan)
-        for part, end in zip(parts, ends, strict=True)
-    ]
-    bands = _bands(curves)
     finals = np.concatenate([part.eval_return[-1] for part in parts])
     worst = min(finals[np.isfinite(finals)], default=math.nan)
     results = [
-        _result(part, band, seeds, worst, _solving_of(part, experiment, min(ends)), min(ends))
-        for part, band, seeds in zip(parts, bands, curves, strict=True)
+        _result(part, grid, worst, _solving_of(part, experiment, min(ends)), min(ends))
+        for part in parts
     ]
     order = sorted(range(len(results)), key=lambda i: _rank(results[i]))
     ranked = [results[i] for i in order]
@@ -148,7 +123,6 @@ def compute_findings(experiment: Experiment) -> Findings:
         order=order,
         grid=grid,
         comparisons=_compare_pairs(ranked[:COMPARED]),
-        few=_ask_few(ranked),
         speeds=compare_speeds(ranked[:COMPARED]),
         until=min(ends),
     )
@@ -174,30 +148,12 @@ def _curve_steps(parts: Sequence[Configuration], end: int) -> np.ndarray:
     return np.unique(np.concatenate([even, early[early < end]]).round())
 
 
-def _bands(curves: Sequence[np.ndarray]) -> list[Estimate]:
-    """Returns the interquartile mean of each set of curves [K, S], and its interval.
-
-    Sets of as many seeds go through the bootstrap together, which draws the seeds once.
-    """
-    bands: dict[int, Estimate] = {}
-    for size in {each.shape[1] for each in curves}:
-        places = [i for i, each in enumerate(curves) if each.shape[1] == size]
-        together = np.stack([curves[i] for i in places])
-        low, high = iqm_interval(together)
-        for n, i in enumerate(places):
-            bands[i] = Estimate(iqm(together[n]), low[n], high[n])
-    return [bands[i] for i in range(len(curves))]
-
-
 def _result(
-    part: Configuration,
-    band: Estimate,
-    seeds: np.ndarray,
-    worst: float,
-    solving: Solving | None,
-    until: int,
+    part: Configuration, grid: np.ndarray, worst: float, solving: Solving | None, until: int
 ) -> Result:
-    final = part.eval_return[-1]
+    final, end = part.eval_return[-1], part.env_steps[-1].min()
+    seeds = on_grid(grid, part.env_steps, part.eval_return)
+    seeds = np.where((grid <= end)[:, None], seeds, np.nan)
     scores = np.where(np.isfinite(final), final, worst)
     areas = mean_while_training(
         np.where(np.isfinite(part.eval_return), part.eval_return, worst), part.env_steps, until
@@ -209,7 +165,7 @@ def _result(
         mean=estimate_mean(scores),
         tail=float(cvar(scores)),
         iqm=Estimate(iqm(final), *iqm_interval(final)),
-        band=band,
+        band=Estimate(iqm(seeds), *iqm_interval(seeds)),
         seeds=seeds,
         area=estimate_mean(areas),
         solving=solving,
@@ -247,16 +203,6 @@ def _compare_pairs(results: Sequence[Result]) -> list[Comparison]:
     if len(results) < 2 or len(shared) < 2:
         return []
     return compare_all([each.scores[np.isin(each.configuration.seed, shared)] for each in results])
-
-
-def _ask_few(results: Sequence[Result]) -> Few | None:
-    """Returns what few seeds would have said of the two best, where there are many seeds."""
-    if len(results) < 2 or min(len(each.final) for each in results[:2]) < 10 * FEW[0]:
-        return None
-    best, second = (each.scores for each in results[:2])
-    enough = [number for number in FEW if 10 * number <= min(len(best), len(second))]
-    wrong = {number: wrong_winner(best, second, number) for number in enough}
-    return Few(wrong, seeds_needed(best, second))
 
 
 def by_speed(results: Sequence[Result]) -> list[int]:

@@ -150,17 +150,13 @@ def _told_apart(sources: Sequence[Source]) -> list[Configuration]:
     parts = []
     for (source, part), settings in zip(pairs, full, strict=True):
         own = {name: settings.get(name) for name in differ}
-        parts.append(
-            part._replace(
-                settings=own, label=settings_in_words(own) or _path_in_words(source.directory.name)
-            )
-        )
-    repeated = {label for label, times in Counter(p.label for p in parts).items() if times > 1}
+        label = settings_in_words(own) or _path_in_words(source.directory.name)
+        parts.append(part._replace(settings=own, label=label))
+    times = Counter(part.label for part in parts)
+    places = [f" in {_path_in_words(source.directory)}" for source, _ in pairs]
     return [
-        part._replace(label=f"{part.label} in {_path_in_words(source.directory)}")
-        if part.label in repeated
-        else part
-        for (source, _), part in zip(pairs, parts, strict=True)
+        part._replace(label=part.label + place * (times[part.label] > 1))
+        for part, place in zip(parts, places, strict=True)
     ]
 
 

@@ -9,10 +9,12 @@ from mjx_reinforce.reports.experiment import counted, ordered, say, setting_in_w
 from mjx_reinforce.reports.findings import COMPARED, Findings, by_speed
 from mjx_reinforce.settings.defaults import OF_TASKS
 from mjx_reinforce.statistics import Estimate, enough
-from mjx_reinforce.statistics.comparisons import Comparison
+from mjx_reinforce.statistics.comparisons import Comparison, seeds_needed, wrong_winner
 
 #: What counts as a difference after Holm's correction.
 LEVEL = 0.05
+#: Seeds with which people compare, and of which the page says how often they err.
+_COUNTS = (3, 5, 10)
 #: Fewer seeds than these give an interval that promises more than it keeps.
 _FEW_SEEDS = 20
 
@@ -142,12 +144,15 @@ def _solving(findings: Findings) -> Iterator[str]:
 
 
 def _few(findings: Findings) -> Iterator[str]:
-    few = findings.few
-    if few is not None and few.wrong and not any(map(math.isnan, few.wrong.values())):
-        each = [f"{percent(share)} of the time with {n}" for n, share in few.wrong.items()]
-        found = f"{few.needed:,} of each would" if few.needed else "10,000 of each would not"
+    """Yields what few seeds would have said of the two best, where there are many seeds."""
+    best, second = (each.scores for each in findings.results[:2])
+    counts = [count for count in _COUNTS if 10 * count <= min(len(best), len(second))]
+    if counts and best.mean() != second.mean():
+        wrong = [f"{percent(wrong_winner(best, second, n))} of the time with {n}" for n in counts]
+        needed = seeds_needed(best, second)
+        found = f"{needed:,} of each would" if needed else "10,000 of each would not"
         yield (
-            f"With few seeds, the next would have looked better than the best {', '.join(each)}; "
+            f"With few seeds, the next would have looked better than the best {', '.join(wrong)}; "
             f"{found} find it four times out of five."
         )
 

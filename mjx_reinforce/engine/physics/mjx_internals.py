@@ -4,7 +4,7 @@ No other file imports MJX's private modules or reads the private part of its dat
 
 - Names that MJX keeps private, here without underscore: the imports, and ``advance``.
 - Fields of ``mjx.Data`` that only MJX's JAX implementation has: ``jax_fields``, ``with_fields``,
-  ``rows_of``, ``with_rows``, ``with_contact``, ``Simulation``, ``num_contacts``.
+  ``rows_of``, ``with_rows``, ``with_contact``, ``Simulation``.
 - Functions of MJX in which a name is given another meaning: ``collision_with`` and ``fenced``. They
   would do nothing, silently, if MJX stopped looking that name up; ``check_lookup`` raises then.
 
@@ -170,8 +170,3 @@ class Simulation:
             if hasattr(part, name):
                 return getattr(part, name)
         raise AttributeError(f"mjx.Data has no field {name!r}; see mjData in MuJoCo's reference")
-
-
-def num_contacts(data: mjx.Data) -> int:
-    """Returns the most contacts that a model can have at once, from its ``mjx.Data``."""
-    return int(jax_fields(data).ncon)

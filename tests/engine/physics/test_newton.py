@@ -167,9 +167,9 @@ def test_other_models_go_to_mjx():
 def test_every_task_with_contacts_is_solved_here():
     for name in envs.names():
         env = envs.make(name)
-        if getattr(env, "num_contacts", 0):
+        if hasattr(env, "mj_model"):
             data = mjx.make_data(env.mj_model, impl="jax")
-            assert newton.supports(env.model, data), name
+            assert newton.supports(env.model, data) or not jax_fields(data).ncon, name
 
 
 # -------------------------------------------------------------------------------------------------
