@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
@@ -31,35 +31,26 @@ if TYPE_CHECKING:
     from mjx_reinforce.runs.perform import Outcome
 
 
-class _Program(NamedTuple):
-    """A command that trains.
-
-    about: its description
-    groups: its settings, dataclasses under their titles
-    """
-
-    about: str
-    groups: Mapping[str, type]
-
-
-_TRAIN = _Program(
+_TRAIN = (
     "Train policies by REINFORCE on MuJoCo, many seeds at once, and report over the seeds. Writes "
     "config.json, metrics.csv, returns.npz, summary.json, learning_curve.png, policy/, checkpoint/ "
     "into the run directory.\n\n"
     "Defaults depend on the task and on the budget. --help shows those of InvertedPendulum-v5 for "
     "about a minute of training on this machine. --help --env ID shows those of another task, and "
-    "with --env-steps N those for N env steps.",
-    GROUPS,
+    "with --env-steps N those for N env steps."
 )
-_SWEEP = _Program(
+_SWEEP = (
     "Train many configurations, many seeds of each, side by side. Writes sweep.json, curves.npz, "
     "report.html, report/results.csv (a row for each configuration and seed) and policies/ (the "
     "best and the worst seed of each configuration) into the output directory. Takes all settings "
     "and presets of python -m mjx_reinforce.train; most settings can be swept. Seed 3 of a "
-    "configuration is seed 3 of train with these settings, up to rounding.",
-    {"sweep": SweepSettings, **GROUPS},
+    "configuration is seed 3 of train with these settings, up to rounding."
 )
-_PROGRAMS = {"train": _TRAIN, "sweep": _SWEEP}
+#: Command -> (its description, its settings: dataclasses under their titles).
+_PROGRAMS: dict[str, tuple[str, dict[str, type]]] = {
+    "train": (_TRAIN, GROUPS),
+    "sweep": (_SWEEP, {"sweep": SweepSettings, **GROUPS}),
+}
 
 
 def parse(arguments: Sequence[str], name: str = "train") -> Design:
@@ -75,7 +66,7 @@ def parse(arguments: Sequence[str], name: str = "train") -> Design:
         code, which is to be named again.
     """
     default, flags, prog = start(arguments, command(name))
-    base, sweep = _read(_PROGRAMS[name], flags, default, prog)
+    base, sweep = _read(name, flags, default, prog)
     if base.minutes is not None and flag_value(flags, "--env-steps"):
         raise ValueError(
             f"--minutes {base.minutes:g} and --env-steps {base.env_steps} both say when the "
@@ -89,7 +80,7 @@ def parse(arguments: Sequence[str], name: str = "train") -> Design:
         return Design(base=base, default=default, over=over, **more)
     known = read_design(base.resume)
     directory, own = base.resume, known.base
-    base, sweep = _read(_PROGRAMS[name], flags, own, prog)
+    base, sweep = _read(name, flags, own, prog)
     if known.over and (base, sweep) != (own, SweepSettings()):
         raise ValueError(f"the sweep in {directory} goes on as it is: give --resume alone")
     resume.check_settings(own, base)
@@ -139,14 +130,14 @@ def _default(arguments: Sequence[str]) -> Config:
 
 
 def _read(
-    program: _Program, arguments: Sequence[str], default: Config, prog: str
+    name: str, arguments: Sequence[str], default: Config, prog: str
 ) -> tuple[Config, SweepSettings]:
     """Returns the settings of a run, and those of a sweep, as flags ask for them.
 
     --help exits.
 
     Args:
-      program: the command.
+      name: of the command.
       arguments: the flags.
       default: holds for the settings of a run that no flag names.
       prog: the name of the program, for --help.
@@ -155,14 +146,14 @@ def _read(
       ValueError: see ``flags.read_command_line``; or the flags say by --seeds and by --num-seeds
         how many seeds there are.
     """
+    about, groups = _PROGRAMS[name]
     known = vars(default)
     forms = [
         (title, group, group(**{f.name: known[f.name] for f in fields(group) if f.name in known}))
-        for title, group in program.groups.items()
+        for title, group in groups.items()
     ]
     form = dataclasses.make_dataclass("Arguments", forms, frozen=True)
-    about = f"{program.about}\n\n{_names()}"
-    parsed = vars(read_command_line(form, arguments, prog, about))
+    parsed = vars(read_command_line(form, arguments, prog, f"{about}\n\n{_names()}"))
     found = {name: x for group in parsed.values() for name, x in vars(group).items()}
     config = Config(**{name: found.pop(name) for name in known})
     if config.seeds is not None:
