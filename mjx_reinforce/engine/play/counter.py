@@ -48,7 +48,8 @@ def at_counter(key: jax.Array, count: jax.Array) -> jax.Array:
       key: [2] uint32, the data of the other key.
       count: [] uint32, how many numbers are skipped.
     """
-    return jax.random.wrap_key_data(jnp.append(key, count), impl=_from_a_count())
+    impl = _generator(3, "threefry2x32 from a count", "count", _refuse, _refuse)
+    return jax.random.wrap_key_data(jnp.append(key, count), impl=impl)
 
 
 def key_of(words: jax.Array) -> jax.Array:
@@ -57,7 +58,8 @@ def key_of(words: jax.Array) -> jax.Array:
     Args:
       words: [2] uint32, the data of JAX's key.
     """
-    return jax.random.wrap_key_data(words, impl=_written_out())
+    impl = _generator(2, "threefry2x32 written out", "written", _split, _fold_in)
+    return jax.random.wrap_key_data(words, impl=impl)
 
 
 def _bits(data: jax.Array, width: int, shape: tuple[int, ...]) -> jax.Array:
@@ -93,19 +95,7 @@ def _refuse(*_: object) -> jax.Array:
 
 
 @functools.cache
-def _from_a_count() -> object:
-    """Returns the generator of keys that skip numbers, which cannot be split."""
-    return _generator((3,), "threefry2x32 from a count", "count", _refuse, _refuse)
-
-
-@functools.cache
-def _written_out() -> object:
-    """Returns JAX's generator, in operations that can be written out."""
-    return _generator((2,), "threefry2x32 written out", "written", _split, _fold_in)
-
-
-def _generator(
-    shape: tuple[int, ...], name: str, tag: str, split: Callable, fold_in: Callable
-) -> object:
-    made = {"key_shape": shape, "name": name, "tag": tag, "split": split, "fold_in": fold_in}
+def _generator(words: int, name: str, tag: str, split: Callable, fold_in: Callable) -> object:
+    """Returns JAX's generator of keys of so many words, in operations that can be written out."""
+    made = {"key_shape": (words,), "name": name, "tag": tag, "split": split, "fold_in": fold_in}
     return random.define_prng_impl(seed=_refuse, random_bits=_bits, **made)

@@ -51,15 +51,11 @@ class Backend(abc.ABC, Generic[Value]):
         """Returns the value of each element of each result of an operation that stays whole."""
         raise UnsupportedPrimitive(f"it has no operation {call.name!r}")
 
-    def result(self, outputs: list[list[Value]]) -> Any:
-        """Returns what the caller gets: here the value of each element of each output."""
-        return outputs
-
-    def compile(self, schedule: Schedule, outputs: list[list[Scalar]]) -> Any:
-        """Runs a whole program; returns its ``result``."""
+    def compile(self, schedule: Schedule, outputs: list[list[Scalar]]) -> list[list[Value]]:
+        """Runs a whole program; returns the value of each element of each output."""
         values: dict[Node, Value] = {}
         self.run(schedule, values)
-        return self.result([[self.value(x, values) for x in leaf] for leaf in outputs])
+        return [[self.value(x, values) for x in leaf] for leaf in outputs]
 
     def run(self, schedule: Schedule, values: dict[Node, Value]) -> None:
         """Adds to the values what the steps of a schedule compute."""

@@ -74,7 +74,10 @@ def scan_rule(graph: Graph, run: Callable, eqn: Equation, used: Any, *operands: 
 
     rows = [ins.unpack([x[t : t + 1] for x in operands[split:]]) for t in order]
     if length <= max(graph.scans, eqn.params["unroll"]):
-        final, table = _unroll(step, carry.unpack(init), rows)
+        final, table = carry.unpack(init), []
+        for row in rows:
+            final, ys = step(final, row)
+            table.append(ys)
     else:
         kept = None
         if iterate.has_loops(body):
@@ -86,15 +89,6 @@ def scan_rule(graph: Graph, run: Callable, eqn: Equation, used: Any, *operands: 
     if not table:
         ys = [arrays.zeros(out.aval) for out in eqn.outvars[num_carry:]]
     return [*carry.pack(final), *ys]
-
-
-def _unroll(step: Iteration, state: list[Scalar], rows: list[list[Scalar]]) -> tuple[list, list]:
-    """Runs the iterations one by one; returns the final carry and the ys of each."""
-    table = []
-    for row in rows:
-        state, ys = step(state, row)
-        table.append(ys)
-    return state, table
 
 
 def _as_loop(
