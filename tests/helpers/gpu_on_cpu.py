@@ -133,14 +133,14 @@ def emulate(monkeypatch, threads=1, block=None):
         code = compiled(text, block)
         return ptx.Kernel(code.key, str(code.addresses[ENTRY]), 256, 1, 0, compiled=True)
 
-    def call(kernel, grid, given, results):
+    def call(kernel, grid, given, first, results):
         size = 32 * -(-threads // 32)
 
         def run(*given):
             given = [np.array(x, order="C") for x in given]
-            made = [np.zeros(x.shape, x.dtype) for x in results]
+            made = [np.full(x.shape, 0 if first else 77, x.dtype) for x in results]
             scratch = [np.full(kernel.scratch * size, np.nan, np.float32)] * bool(kernel.scratch)
-            run_threads(int(kernel.text), threads, [*given, *made, *made, *scratch])
+            run_threads(int(kernel.text), threads, [*given, *made * bool(first), *made, *scratch])
             return made
 
         return jax.pure_callback(run, results, *given)

@@ -336,8 +336,7 @@ def mapping_text(written: scalarized.Scalarized) -> str:
     """Returns the LLVM IR of ``@play``, without a target.
 
     Its arguments are pointers to: sizes [2] int32 (examples N, threads in all), the leaves [N, ...]
-    of the function's arguments that are not empty; as many again as there are results, which it
-    does not read; and the results, the leaves of the function's result that are not empty. Thread k
+    of the function's arguments that are not empty, and those of its result, likewise. Thread k
     computes the examples k, k + threads and so on.
 
     Args:
@@ -381,5 +380,5 @@ def mapping_text(written: scalarized.Scalarized) -> str:
     text.line("ret void")
     parameters = ["ptr noalias readonly %sizes"]
     parameters += [f"ptr noalias readonly %given{k}" for k in given]
-    parameters += [*(f"ptr %zero{k}" for k in made), *(f"ptr %made{k}" for k in made)]
+    parameters += [f"ptr %made{k}" for k in made]
     return entry_text(text, parameters, written)

@@ -159,14 +159,12 @@ def _launch(
     kernel: ptx.Kernel, record: Sequence[jax.ShapeDtypeStruct], horizon: int, *args: jax.Array
 ) -> Sequence[jax.Array]:
     seeds, episodes = args[0].shape
-    shape = jax.ShapeDtypeStruct
-    records = [
-        shape((seeds, horizon, int(np.prod(x.shape, dtype=int)), episodes), x.dtype) for x in record
-    ]
-    counts = [shape(x, jnp.int32) for x in ((seeds, episodes), (seeds, episodes), (seeds,), (1,))]
+    counts = (seeds, episodes), (seeds, episodes), (seeds,), (1,)
+    zeros = [jnp.zeros((seeds, horizon, math.prod(x.shape), episodes), x.dtype) for x in record]
+    zeros += [jnp.zeros(x, jnp.int32) for x in counts]
     kernel, grid = _sized(kernel, seeds * episodes)
     sizes = jnp.array([seeds, episodes, horizon], jnp.int32)
-    return _call(kernel, grid, [sizes, *args], [*records, *counts])[:-1]
+    return _call(kernel, grid, [sizes, *args], zeros, zeros)[:-1]
 
 
 def launch_map(
@@ -185,7 +183,7 @@ def launch_map(
         sized, grid = _sized(kernel, examples)
         sizes = jnp.array([examples, math.prod(grid)], jnp.int32)
         made = [jax.ShapeDtypeStruct((examples, *x.shape[1:]), x.dtype) for x in results]
-        return _call(sized, grid, [sizes, *args], made)
+        return _call(sized, grid, [sizes, *args], [], made)
 
     return in_one_launch(play)(*args)
 
@@ -194,20 +192,20 @@ def _call(
     kernel: ptx.Kernel,
     grid: tuple[int, int],
     given: Sequence[jax.Array],
-    results: Sequence[jax.ShapeDtypeStruct],
+    first: Sequence[jax.Array],
+    results: Sequence[jax.ShapeDtypeStruct | jax.Array],
 ) -> Sequence[jax.Array]:
-    """Launches so many blocks of so many threads; returns what they make of zeros of these shapes.
+    """Launches so many blocks of so many threads; returns what they make of what was there first.
 
-    They also write into a buffer that begins with any values, if the kernel has scratch.
+    If nothing was, they write all of it. If the kernel has scratch, it begins with any values.
     """
     words = kernel.scratch * math.prod(grid)
     scratch = [jax.ShapeDtypeStruct((words,), jnp.int32)] if words else []
-    zeros = [jnp.zeros(x.shape, x.dtype) for x in results]
-    aliases = {len(given) + k: k for k in range(len(results))}
+    aliases = {len(given) + k: k for k in range(len(first))}
     blocks, threads = map(np.int32, grid)
     target = _handler(kernel)
     call = jax.ffi.ffi_call(target, [*results, *scratch], input_output_aliases=aliases)
-    return call(*given, *zeros, blocks=blocks, threads=threads)[: len(results)]
+    return call(*given, *first, blocks=blocks, threads=threads)[: len(results)]
 
 
 def _sized(kernel: ptx.Kernel, items: int) -> tuple[ptx.Kernel, tuple[int, int]]:

@@ -220,6 +220,7 @@ class VectorEnv:
         self.engine: MapEngine = map_function(
             engine, env, advance, self._blank, self._null_action, flag
         )
+        self._call = jax.jit(self.engine.call)
 
     def reset(self, key: jax.Array) -> VectorState:
         """Returns N environments at the start of their first episodes.
@@ -314,7 +315,7 @@ class VectorEnv:
 
     def _advance(self, state: VectorState, action: jax.Array, begins: ArrayLike) -> VectorState:
         self.check_state(state)
-        return self.engine.call(state, action, jnp.broadcast_to(begins, self.num_envs))
+        return self._call(state, action, jnp.broadcast_to(begins, self.num_envs))
 
     def _null_actions(self) -> jax.Array:
         return jnp.zeros((self.num_envs, *self._null_action.shape), self._null_action.dtype)

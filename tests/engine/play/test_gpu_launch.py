@@ -240,7 +240,7 @@ def in_memory(monkeypatch, tmp_path):
 
 
 def launch(x):
-    return seam._call(KERNEL, (3, 64), [x], [x])[0]
+    return seam._call(KERNEL, (3, 64), [x], [x], [x])[0]
 
 
 def test_a_program_calls_the_handler(in_memory, monkeypatch, tmp_path):
