@@ -59,7 +59,8 @@ extern "C" KERNEL play({parameters}) {{
 {begin}
       t.sync();
     }}
-    if (!t.some(running)) break;
+    if (!t.meet(running)) break;
+    if (!t.some(running)) {{ t.attend({meets}); continue; }}
     const int seed = item / episodes;
     const int in_at[1] = {{at}}, in_mode[1] = {{mode}};
 {step}
@@ -84,7 +85,9 @@ extern "C" KERNEL play({parameters}) {{
 _MAP = """
 extern "C" KERNEL play({parameters}) {{
   OWN_PLACE
-  for (int k = t.first(); k < sizes[0]; k += t.stride()) {{
+  for (int item = t.first(); t.meet(item < sizes[0]); item += t.stride()) {{
+    if (!t.some(item < sizes[0])) {{ t.attend({meets}); continue; }}
+    const int k = item < sizes[0] ? item : sizes[0] - 1;
 {step}
     t.sync();
   }}
@@ -106,10 +109,8 @@ def player_text(written: scalarized.Scalarized, physics: Physics, num_actor: int
     words = [-(-counts[k] * np.dtype(written.in_avals[k].dtype).itemsize // 4) for k in own]
     offsets = dict(zip(own, np.cumsum([0, *words]).tolist(), strict=False))
 
-    def name(number: int) -> str:
-        return {at: "in_at", at + 1: "in_mode"}.get(number, f"in{number}")
-
-    text = CText(written, name, physics.skip)
+    names = {at: "in_at", at + 1: "in_mode"}
+    text = CText(written, lambda number: names.get(number, f"in{number}"), physics.skip)
     observation, action, (reward,), (goes_on,), (broken,), *carried = written.outputs
     text.line(f"const bool alive = {text.get(goes_on)} != 0;")
     text.line(f"const int is_broken = {text.get(broken)};")
@@ -137,13 +138,14 @@ def player_text(written: scalarized.Scalarized, physics: Physics, num_actor: int
     given = [*zip(("int", "int", "unsigned"), CONTROLS, strict=True)]
     given += [(kinds[k], f"actor{k}") for k in range(num_actor) if counts[k]]
     given += [(kinds[k], f"state{k - num_actor}") for k in range(num_actor, keys) if counts[k]]
-    made = zip([*_kinds(written.out_avals[:3]), *["int"] * 4], RESULTS, strict=True)
+    made = [*zip([*_kinds(written.out_avals[:3]), *["int"] * 4], RESULTS, strict=True)]
     loop = _PLAY.format(
-        parameters=_parameters(given, [*made]),
+        parameters=_parameters([*given, *((kind, f"zero_{name}") for kind, name in made)], made),
         own=sum(words),
         begin="\n".join(begin),
         step="\n".join([*before, *text.lines]),
         record="\n".join(record),
+        meets=text.meets,
     )
     return _kernel(physics, text, loop, 2 * sum(words) + text.words)
 
@@ -168,7 +170,7 @@ def mapping_text(written: scalarized.Scalarized, physics: Physics) -> str:
         [("int", "sizes"), *((kind, f"given{k}") for k, kind, _ in given)],
         [(kind, f"made{k}") for k, kind, _ in made],
     )
-    loop = _MAP.format(parameters=parameters, step="\n".join([*before, *text.lines]))
+    loop = _MAP.format(parameters=parameters, step="\n".join(before + text.lines), meets=text.meets)
     return _kernel(physics, text, loop, text.words)
 
 
@@ -178,19 +180,16 @@ def _kinds(avals: Iterable[jax.ShapeDtypeStruct]) -> list[str]:
 
 def _parameters(given: Iterable[tuple[str, str]], made: Sequence[tuple[str, str]]) -> str:
     """Returns the parameters of a kernel by their types and names: what it reads and writes."""
-    parts = [f"const {kind}* __restrict__ {name}" for kind, name in given]
-    parts += [f"const {kind}* zero_{name}" for kind, name in made]
-    parts += [f"{kind}* {name}" for kind, name in made]
-    return ", ".join([*parts, "Word* scratch"])
+    read = (f"const {kind}* __restrict__ {name}" for kind, name in given)
+    return ", ".join([*read, *(f"{kind}* {name}" for kind, name in made), "Word* scratch"])
 
 
 def _kernel(physics: Physics, text: CText, loop: str, words: int) -> str:
     """Returns a kernel whose teams have so many words of scratch each, besides far contacts."""
     a_thread = max(1, -(-(physics.far + words) // physics.lanes))
-    constants: dict[str, object] = {"W": physics.lanes, "SHARED": physics.shared}
-    constants |= {"FAR_WORDS": physics.far, "THREAD_WORDS": a_thread}
-    constants["REPORTS"] = f"({' | '.join(text.reports) or 0})"
-    head = "".join(f"#define {key} {value}\n" for key, value in constants.items())
+    head = f"#define W {physics.lanes}\n#define SHARED {physics.shared}\n"
+    head += f"#define REPORTS ({' | '.join(text.reports) or 0})\n"
+    head += f"#define FAR_WORDS {physics.far}\n#define THREAD_WORDS {a_thread}\n"
     whole = f"{_warps(FEW_WARPS)}{head}{physics.text}\n{loop}"
     return ptx.team_text(whole, physics.lanes, 32 * FEW_WARPS, physics.shared, a_thread)
 
@@ -213,8 +212,6 @@ def for_items(kernel: ptx.Kernel, items: int, processors: int, capability: str) 
 
     def write() -> str:
         text = kernel.text.partition("\n")[2].replace(_warps(FEW_WARPS), _warps(_MANY_WARPS), 1)
-        threads = 32 * _MANY_WARPS
-        return ptx.team_text(text, kernel.lanes, threads, kernel.shared, kernel.scratch)
+        return ptx.team_text(text, kernel.lanes, 32 * _MANY_WARPS, kernel.shared, kernel.scratch)
 
-    source = f"{kernel.key} {_MANY_WARPS} warps"
-    return ptx.load_kernel(source, write, capability, objects.folder())
+    return ptx.load_kernel(f"{kernel.key} {_MANY_WARPS} warps", write, capability, objects.folder())

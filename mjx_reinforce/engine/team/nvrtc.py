@@ -17,12 +17,9 @@ def library() -> ctypes.CDLL | None:
     nvidia = importlib.util.find_spec("nvidia")
     folders = map(Path, (nvidia and nvidia.submodule_search_locations) or [])
     found = [path for folder in folders for name in _NAMES for path in sorted(folder.glob(name))]
-    named = [
-        str(path) for path in found if "builtins" not in path.name and ".alt." not in path.name
-    ]
-    for name in (*named, f"{os.environ.get('CUDA_HOME', '/usr/local/cuda')}/lib64/libnvrtc.so"):
+    for file in (*found, Path(os.environ.get("CUDA_HOME", "/usr/local/cuda"), "lib64/libnvrtc.so")):
         try:
-            return ctypes.CDLL(name)
+            return ctypes.CDLL(str(file))
         except OSError:
             continue
     return None

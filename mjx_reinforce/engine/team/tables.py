@@ -20,7 +20,7 @@ _C: Any = mujoco  # a C extension without stubs
 _GEOM, _EQUALITY = _C.mjtGeom, _C.mjtEq
 _FREE, _BALL, _SLIDE, _HINGE = range(4)  # MuJoCo's mjtJoint
 _FILES = (
-    *("algebra", "state", "kinematics", "dynamics", "impedance", "bounds", "contact_rows"),
+    *("algebra", "state", "block", "kinematics", "dynamics", "impedance", "bounds", "contact_rows"),
     *("rounds", "boxes", "collision", "equality", "elimination", "newton", "report"),
     *("integrators", "scalar", "launch"),
 )

@@ -45,10 +45,10 @@ _GIVEN = ("ctrl", "time", "qpos", "qvel", "act", "qacc_warmstart")
 _REPORTED = ("xpos", "xipos", "cinert", "cvel", "cfrc_ext")
 #: Where the device code has the fields of a simulation, by MuJoCo's names.
 _FIELDS = {field: f"s.{field}" for field in (*_GIVEN, *_REPORTED, "qfrc_actuator")}
-#: The operations that simulate, as the device code has them.
+#: The operations that simulate, as the device code has them, and how often teams meet in them.
 _SIMULATES = {
-    "physics": "const bool {}[1] = {{physics(t, M, s, {})}};",
-    "start": "const bool {}[1] = {{true}}; start(t, M, s);",
+    "physics": ("const bool {}[1] = {{physics({}, M, s, {})}};", " + {} * STAGES"),
+    "start": ("const bool {}[1] = {{true}}; start({}, M, s);", " + 1"),
 }
 
 
@@ -65,6 +65,7 @@ class CText(Backend[str]):
     words: how many words of 4 bytes ``scratch`` has, so far.
     read: the numbers of the arguments that were read, so far.
     reports: what the physics reports, by the names of ``device/state.h``.
+    meets: how often teams meet: in the physics outside of branches and loops, as an expression.
     """
 
     def __init__(self, written: scalarized.Scalarized, inputs: Callable[[int], str], skip: int):
@@ -79,6 +80,7 @@ class CText(Backend[str]):
         self.words = 0
         self.read: set[int] = set()
         self.reports: list[str] = []
+        self.meets, self._depth = "0", 0
         self._inputs, self._skip = inputs, skip
         self._values: dict[Node, str] = {}
         self._steps = _owners(written.schedule)
@@ -254,7 +256,9 @@ class CText(Backend[str]):
         before = self._values, self._written
         self._values, self._written = {**self._values, **known}, dict(self._written)
         self._steps |= _owners(body)
+        self._depth += 1
         yield
+        self._depth -= 1
         self._values, self._written = before
         self._form_of.clear()
 
@@ -302,23 +306,25 @@ class CText(Backend[str]):
         names = [field.rpartition(".")[2] for field in call.fields]
         sound = self.name()
         fields = {**_FIELDS, "sound": sound}
-        for number, (name, out) in enumerate(zip(names, call.outs, strict=True)):
-            if out and name not in fields:
-                raise UnsupportedPrimitive(f"the task reads {name} of the simulation")
-            self._arrays[call, number] = fields.get(name, "")
-            self.reports += [name.upper()] if out and name in _REPORTED else []
         for field, scalars in zip(_GIVEN, call.args, strict=True):
             if scalars:
                 self.fill(_FIELDS[field], scalars)
         if self._simulates_once:
             self._read_from(_FIELDS["ctrl"], call.args[0])  # which the physics leaves as it is
-        self.lines += ["t.sync();", _SIMULATES[call.name].format(sound, self._skip), "t.sync();"]
-        if not self._simulates_once:  # another operation may overwrite it
-            for number, (name, out) in enumerate(zip(names, call.outs, strict=True)):
-                if out:
-                    made = self._arrays[call, number] = self._reserve(out[0].dtype, len(out))
-                    self.line(f"EACH(i, {len(out)}) {made}[i] = {fields[name]}[i];")
-            self.line("t.sync();")
+        simulate, meets = _SIMULATES[call.name]
+        self.meets += "" if self._depth else meets.format(self._skip)
+        team = "t.alone()" if self._depth else "t"
+        self.lines += ["t.sync();", simulate.format(sound, team, self._skip)]
+        for number, (name, out) in enumerate(zip(names, call.outs, strict=True)):
+            if out and name not in fields:
+                raise UnsupportedPrimitive(f"the task reads {name} of the simulation")
+            made = fields.get(name, "")
+            if out and not self._simulates_once:  # another operation may overwrite it
+                made = self._reserve(out[0].dtype, len(out))
+                self.line(f"EACH(i, {len(out)}) {made}[i] = {fields[name]}[i];")
+            self._arrays[call, number] = made
+            self.reports += [name.upper()] if out and name in _REPORTED else []
+        self.line("t.sync();")
 
     def _row(self, row: list[Scalar], values: dict[Node, str]) -> Callable[[str], str]:
         """Returns what an element of a loop is in the iteration of a number."""

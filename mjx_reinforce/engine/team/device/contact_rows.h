@@ -80,7 +80,8 @@ template <class F> DEV void all_contacts(const Team& t, State& s, F act) {
       t.sync();
       char* to = reinterpret_cast<char*>(&s.guest);
       const char* from = reinterpret_cast<const char*>(s.far + (c - NEAR));
-      for (int k = 4 * t.lane; k < int(sizeof(Contact)); k += 4 * W) memcpy(to + k, from + k, 4);
+      for (int k = 4 * t.lane; k < int(sizeof(Contact)); k += 4 * W)
+        memcpy(to + k, __builtin_assume_aligned(from + k, 4), 4);
       t.sync();
       one = &s.guest;
     }

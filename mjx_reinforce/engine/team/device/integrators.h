@@ -1,8 +1,12 @@
 // A step of MuJoCo (mj_step), and what a task reads after it.
 #pragma once
 
+// How many accelerations a step needs.
+constexpr int STAGES = RK4 ? 4 : 1;
+
 // The acceleration, in s.qacc_warmstart (mj_forward). Returns the Newton steps.
 DEV int forward(const Team& given, const Model& M, State& s) {
+  given.meet();
   const Team t = given.anew();
   place_links(t, M, s);
   place_dofs(t, M, s);
@@ -74,7 +78,7 @@ DEV void runge_kutta(const Team& t, const Model& M, State& s, bool last) {
   }
   EACH(n, 3 * NTURN) s.turning[n] = 0;
   t.sync();
-  LOOP for (int stage = 0; stage < 4; stage++) {
+  LOOP for (int stage = 0; stage < STAGES; stage++) {
     forward(t, M, s);
     if (last && stage == 3) report(t, M, s);
     const real h = M.timestep, at = stage == 0 ? real(0) : stage == 3 ? h : h / 2;

@@ -36,6 +36,7 @@ constexpr bool SINGLE = sizeof(real) == 4;
 struct Team {
   unsigned mask;
   int lane;
+  bool meets = true;  // whether other teams come to each meeting, too
   DEV Team() {
     const int place = threadIdx.x & 31;
     lane = place % W;
@@ -48,6 +49,13 @@ struct Team {
     t.lane &= W - 1;
     return t;
   }
+  // The same team where others may not come: in a branch.
+  DEV Team alone() const {
+    Team t = *this;
+    t.meets = false;
+    return t;
+  }
+  DEV bool meet(bool flag = false) const;
   DEV void sync() const { __syncwarp(mask); }
   DEV bool any(bool flag) const { return __any_sync(mask, flag); }
   // One bit a lane.
@@ -71,6 +79,8 @@ DEV void sine_cosine(real x, real& s, real& c) { sincospif(x * real(0.3183098861
 struct Team {
   int lane = 0;
   Team anew() const { return *this; }
+  Team alone() const { return *this; }
+  bool meet(bool flag = false) const { return flag; }
   void sync() const {}
   bool any(bool flag) const { return flag; }
   unsigned ballot(bool flag) const { return flag; }

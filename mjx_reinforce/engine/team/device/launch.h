@@ -7,10 +7,6 @@ static_assert(FAR * sizeof(Contact) <= sizeof(real) * (FAR_WORDS), "no room for 
 
 #ifdef __CUDACC__
 #define KERNEL __global__ void __launch_bounds__(WARPS * 32, 1)
-constexpr int WHOLE = 32 / W;
-constexpr int FITTING = int((SHARED - sizeof(Model) - 16) / sizeof(State)) / WHOLE * WHOLE;
-constexpr int TEAMS = FITTING < WARPS * WHOLE ? FITTING : WARPS * WHOLE;
-static_assert(TEAMS > 0, "the state of a team does not fit into shared memory");
 __device__ const Model MODEL MODEL_INIT;
 struct Shared { Model m; State s[TEAMS]; };
 extern __shared__ __align__(16) char shared_bytes[];
@@ -22,6 +18,8 @@ struct Player : Team {
     return __shfl_sync(mask, k, 0, W);
   }
   DEV bool some(bool flag) const { return __any_sync(0xffffffffu, flag); }  // of the warp
+  // Goes to so many meetings, for a warp that has nothing to play.
+  DEV void attend(int meetings) const { LOOP for (int n = 0; n < meetings; n++) meet(); }
   DEV void add(int* sum, int x) const { atomicAdd(sum, x); }
   // The items of a function that is mapped.
   DEV int stride() const { return gridDim.x * min(TEAMS, int(blockDim.x) / W); }
@@ -47,6 +45,7 @@ static const Model MODEL MODEL_INIT;
 struct Player : Team {
   int next(int* counter) const { return (*counter)++; }
   bool some(bool flag) const { return flag; }
+  void attend(int) const {}
   void add(int* sum, int x) const { *sum += x; }
   int stride() const { return 1; }
   int first() const { return 0; }
