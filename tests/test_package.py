@@ -161,7 +161,7 @@ def test_import_is_light():
 
 def test_the_engine_stands_by_itself():
     """It is imported in an instant; all its names load JAX, and of this package the engine."""
-    late = ("flax", "optax", "tyro", "rich", "brax", "mujoco", "gymnasium")
+    late = ("flax", "optax", "tyro", "rich", "matplotlib", "brax", "mujoco", "gymnasium")
     instant, others, ours = run(
         "import sys, mjx_reinforce.engine as engine\n"
         "print('jax' in sys.modules)\n"
@@ -182,7 +182,7 @@ def test_what_reads_a_command_line_is_light(command):
 
 def test_pages_films_and_logs_wait():
     """What draws and logs is imported when something is drawn or logged."""
-    late = ("vl_convert", "jinja2", "tensorboardX", "PIL")
+    late = ("vl_convert", "jinja2", "tensorboardX", "matplotlib", "PIL")
     loaded = run(
         "import sys, mjx_reinforce.train, mjx_reinforce.watch, mjx_reinforce.runs.command_line\n"
         "import mjx_reinforce.runs.results, mjx_reinforce.runs.saving\n"

@@ -59,7 +59,7 @@ def one_sample(draws: int) -> Iterator[tuple[str, str, list[str]]]:
 
 
 def rates(draws: int) -> Iterator[tuple[str, str, list[str]]]:
-    """Yields the same for a rate: solved, collapsed, above a return of the profile."""
+    """Yields the same for a rate: solved, collapsed."""
     for rate in (0.5, 0.9, 0.97):
         cells = []
         for num_seeds in SEEDS:

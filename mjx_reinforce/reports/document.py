@@ -11,14 +11,14 @@ import jinja2
 from markupsafe import Markup
 
 from mjx_reinforce.reports import charts, words
-from mjx_reinforce.reports.charts import curves, distribution, final, profile, sensitivity, solved
+from mjx_reinforce.reports.charts import curves, distribution, final, sensitivity, solved
 from mjx_reinforce.reports.experiment import Experiment, counted, say, setting_in_words
 from mjx_reinforce.reports.findings import COMPARED, Findings
 from mjx_reinforce.reports.listings import listings
 from mjx_reinforce.reports.words import steps
 
 #: The charts in the order of the page.
-_CHARTS = (final, curves, solved, distribution, profile, sensitivity)
+_CHARTS = (final, curves, solved, distribution, sensitivity)
 _TEMPLATES = resources.files("mjx_reinforce.reports") / "files"
 
 
@@ -108,7 +108,7 @@ def _text(findings: Findings, drawn: list[charts.Chart]) -> dict[str, Any]:
     figures = {figure.name: figure for figure in drawn}
     sensitivity = [figure for figure in drawn if figure.name.startswith("sensitivity-")]
     listed = listings(findings)
-    names = ("final", "curves", "solved", "distribution", "profile")
+    names = ("final", "curves", "solved", "distribution")
     failures = any(not math.isfinite(x) for each in findings.results for x in each.final)
     return {
         "answer": words.headline(findings),

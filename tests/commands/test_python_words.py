@@ -172,7 +172,7 @@ def test_modules_are_attributes():
 
 def test_help_says_it():
     for name, words in (
-        ("reinforce", "sum_n sum_t (weight[t, n] log pi(a[t, n] | o[t, n])"),
+        ("reinforce", "sum_n sum_t (w[t, n] log pi(a[t, n] | o[t, n])"),
         ("train_step", "train_step(learner"),
         ("Policy", "distribution.constants"),
     ):

@@ -79,7 +79,7 @@ def test_every_figure_is_a_vector_and_every_table_has_a_number(crossed):
     beside, page = crossed[0] / "report", crossed[0] / "report.html"
     buttons = set(re.findall(r'data-png="([^"]+)"', page.read_text(encoding="utf-8")))
     assert buttons == {path.stem for path in beside.glob("*.png")}
-    names = ("final", "curves", "solved", "distribution", "profile")
+    names = ("final", "curves", "solved", "distribution")
     assert buttons == {*names, "sensitivity-0", "sensitivity-1"}
     for path in beside.glob("*.png"):
         assert path.read_bytes().startswith(b"\x89PNG")

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rliable import library, metrics
+from rliable import metrics
 from scipy import stats
 
 from mjx_reinforce.statistics import iqm, iqm_interval
-from mjx_reinforce.statistics.aggregates import cvar, estimate_mean, performance_profile, wilson
+from mjx_reinforce.statistics.aggregates import cvar, estimate_mean, wilson
 
 
 def test_values_are_those_of_rliable():
@@ -60,20 +60,8 @@ def test_a_better_seed_makes_nothing_worse(values, place, more):
         assert np.isnan(old) or new >= old - 1e-9
 
 
-def test_profile_is_that_of_rliable():
-    values = np.round(np.random.default_rng(1).normal(size=50), 1)
-    thresholds = np.linspace(-3, 3, 61).round(1)  # many of them are values
-    expected = library.score_distributions(values[:, None], thresholds)
-    np.testing.assert_array_equal(performance_profile(values, thresholds).value, expected)
-
-
-def test_a_failed_seed_is_above_nothing():
-    values = np.array([np.nan, np.inf, -np.inf, 5.0])
-    np.testing.assert_array_equal(performance_profile(values, [-1e300, 5.0]).value, [0.25, 0.0])
-
-
 @pytest.mark.parametrize("confidence", [0.5, 0.99])
 def test_the_band_has_the_level_that_is_asked_for(confidence):
-    band = performance_profile([1.0, 2.0, 3.0, 4.0], [2.5], confidence)
+    band = wilson(2, 4, confidence)
     expected = stats.binomtest(2, 4).proportion_ci(confidence, method="wilson")
-    np.testing.assert_allclose([band.low[0], band.high[0]], expected, atol=1e-14)
+    np.testing.assert_allclose([band.low, band.high], expected, atol=1e-14)

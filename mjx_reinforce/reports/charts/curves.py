@@ -1,5 +1,6 @@
 """Learning curves: the interquartile mean and its band; of one configuration, its seeds too."""
 
+import io
 from collections.abc import Iterator
 from typing import Any
 
@@ -7,13 +8,14 @@ import numpy as np
 
 from mjx_reinforce.reports import charts
 from mjx_reinforce.reports.charts import Table, short, stacked
-from mjx_reinforce.reports.experiment import Configuration, Experiment
-from mjx_reinforce.reports.findings import Findings, Result, compute_findings, from_the_worst
+from mjx_reinforce.reports.findings import Findings, Result, from_the_worst, on_grid
 from mjx_reinforce.reports.words import number
+from mjx_reinforce.statistics import iqm, iqm_interval
 
 #: Seeds that are drawn one by one: of one configuration, and of all together.
 _DRAWN_OF_ONE = 40
 _DRAWN_OF_ALL = 480
+_RETURN = "return of the deterministic policy"
 
 
 def draw(findings: Findings) -> Iterator[charts.Chart]:
@@ -50,25 +52,38 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
 
 
 def picture(env: str, threshold: float | None, history: dict[str, np.ndarray]) -> bytes:
-    """Returns the chart of a run's seeds as a PNG file.
+    """Returns a run's seeds, their interquartile mean and its band as a PNG file.
 
     Args:
       env: its id.
       threshold: the return that counts as solved, if any.
       history: ``eval_return`` and ``env_steps`` [E, S] of its evaluations.
     """
-    seeds = np.arange(history["eval_return"].shape[1])
-    shown = Configuration(
-        env, {}, history["eval_return"], history["env_steps"], np.zeros_like(seeds), seeds
-    )
-    experiment = Experiment(env, env, threshold, [shown], {}, {}, {}, [], [], [])
-    (chart,) = draw(compute_findings(experiment))
-    return charts.render_chart(chart, [env], env)["png"]
+    from matplotlib.figure import Figure
+
+    returns, steps = history["eval_return"], history["env_steps"]
+    grid = np.linspace(0, steps[-1].min(), 200)
+    curves, seeds = on_grid(grid, steps, returns), returns.shape[1]
+    figure = Figure(figsize=(8, 4.5), dpi=150, layout="constrained")
+    axes = figure.subplots()
+    axes.plot(steps, returns, color="tab:blue", linewidth=0.7, alpha=max(0.03, min(0.5, 4 / seeds)))
+    axes.plot(grid, iqm(curves), color="tab:blue", linewidth=2)
+    if seeds > 1:
+        axes.fill_between(grid, *iqm_interval(curves), color="tab:blue", alpha=0.25, linewidth=0)
+    known = returns[np.isfinite(returns)]
+    if threshold is not None and known.size and known.min() <= threshold <= known.max():
+        axes.axhline(threshold, color="0.3", linestyle="--", linewidth=1)
+    shown = f"interquartile mean of {seeds} seeds and its 95 % interval" if seeds > 1 else "1 seed"
+    axes.set(title=f"{env}: {shown}", xlabel="env steps per seed", ylabel=_RETURN)
+    axes.xaxis.set_major_formatter("{x:,.0f}")
+    axes.grid(alpha=0.3)
+    file = io.BytesIO()
+    figure.savefig(file, format="png")
+    return file.getvalue()
 
 
 def _return(field: str) -> charts.Spec:
-    title = "return of the deterministic policy"
-    return charts.quantity(field, title=title, scale={"zero": False})
+    return charts.quantity(field, title=_RETURN, scale={"zero": False})
 
 
 def _lines_of_seeds() -> charts.Spec:
