@@ -127,11 +127,12 @@ def span(name: str, pairs: list[tuple[str, Any, Any]]) -> str:
 def readme(raw: Raw) -> str:
     """The line of README.md."""
     on_gpu, warp = (best(raw.gpu, FEW[2], engine) for engine in ("native", "MuJoCo Warp"))
-    on_cpu, c_mujoco = best(raw.cpu, FEW[2], "native", "float32"), best(raw.cpu, FEW[2], "C MuJoCo")
+    on_cpu, equal = (best(raw.cpu, FEW[2], "native", x) for x in ("float32", "float64"))
+    c_mujoco = best(raw.cpu, FEW[2], "C MuJoCo")
     return textwrap.fill(
-        f"HalfCheetah plays {rate(on_gpu)} env steps per second on one H100, "
-        f"{ratio(on_gpu, warp)} times as many as in MuJoCo Warp, and {rate(on_cpu)} on two CPU "
-        f"cores, {ratio(on_cpu, c_mujoco)} times as many as in C MuJoCo (float64).",
+        f"HalfCheetah plays {rate(on_gpu)} env steps per second on one H100, {ratio(on_gpu, warp)}"
+        f" times as many as in MuJoCo Warp. On two CPU cores it plays {rate(on_cpu)}, "
+        f"{ratio(on_cpu, c_mujoco)} times C MuJoCo's ({ratio(equal, c_mujoco)} in float64).",
         110,
     )
 
@@ -147,10 +148,9 @@ def words(raw: Raw) -> str:
         single.append((task, cpu, c_mujoco))
         equal.append((task, double, c_mujoco))
     return textwrap.fill(
-        "On two cores `native` plays the first six tasks below at "
-        f"{span('the speed of C MuJoCo', equal)} in equal precision. In float32, in which it "
-        f"trains, that is {span('its speed', single)}. On the GPU it is "
-        f"{span('the speed of MuJoCo Warp', warp)}.",
+        f"On two cores `native` plays the first six tasks at {span('the speed of C MuJoCo', equal)}"
+        f" in equal precision. In float32, in which it trains, that is {span('its speed', single)}."
+        f" On the GPU it is {span('the speed of MuJoCo Warp', warp)}.",
         110,
     )
 
