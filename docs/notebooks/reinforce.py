@@ -4,9 +4,15 @@
 # A policy $\pi_\theta(a \mid o)$ draws an action $a$ for an observation $o$. An episode earns the return
 # $R = r_0 + \dots + r_{T-1}$. We look for parameters $\theta$ with a large mean return $J(\theta) = E[R]$.
 #
-# The mean is over episodes whose probability depends on $\theta$. The derivative of a probability is
-# $\nabla p = p \nabla \log p$. The probabilities of the environment do not depend on $\theta$, so that only those of the
-# actions remain (Williams 1992):
+# The mean is over episodes $\tau$ whose probability $p_\theta(\tau)$ depends on $\theta$:
+# $J(\theta) = \sum_\tau p_\theta(\tau) R(\tau)$. The derivative of a probability is $\nabla p = p \nabla \log p$. The
+# gradient is therefore again a mean over episodes, which we can estimate by playing some:
+#
+# $$\nabla J(\theta) = \sum_\tau R(\tau) \, p_\theta(\tau) \nabla \log p_\theta(\tau) = E\left[ R \, \nabla \log p_\theta(\tau) \right]$$
+#
+# The probability of an episode is a product: that of its start, and for each step that of the action and that of what
+# the environment does next. Its logarithm is a sum. Only the terms of the actions depend on $\theta$, so
+# $\nabla \log p_\theta(\tau) = \sum_t \nabla \log \pi_\theta(a_t \mid o_t)$, and (Williams 1992)
 #
 # $$\nabla J(\theta) = E\left[ \sum_t W_t \nabla \log \pi_\theta(a_t \mid o_t) \right]$$
 #
@@ -31,6 +37,9 @@ jax.config.update("jax_enable_x64", True)  # to compare gradients to the last di
 # ## In sixty lines
 #
 # CartPole: push a cart left or right so that its pole stays up. One point for each step, 500 at most.
+#
+# `network` computes $\log \pi_\theta(\cdot \mid o)$ up to a constant, and its parameters are $\theta$. `episode` draws
+# $\tau$, `weights` computes $W_t$, and `gradient` is $\nabla J(\theta)$ with the mean over the episodes played.
 
 # %%
 env = mr.envs.make("CartPole-v1")
@@ -167,3 +176,13 @@ assert error < 1e-6
 # 2. Subtract the mean over *all* episodes in place of the others. By which factor does the gradient shrink?
 # 3. Set the discount to 1, then to 0.9.
 # 4. Train 64 seeds by `jax.vmap` and look at the worst. The next notebook does this with a thousand.
+#
+# ## What we found
+#
+# A count of updates is the first update whose mean return reaches 400: the median of 32 seeds, of 150 updates each.
+#
+# 1. 72 updates in place of 42. Two of the 32 seeds never reach 400.
+# 2. By $(N - 1) / N$, here 15/16: $G_n$ less the mean of all is $(N - 1) / N$ times $G_n$ less the mean of the others.
+# 3. With 1: 40 updates, no clear difference. With 0.9: 67 updates, and 8 of 32 seeds never reach 400. An action looks
+#    only some 10 steps ahead, and a pole takes longer to fall. Later the seeds fall back, to a mean of 254.
+# 4. In the last five of 60 updates, the mean of 64 seeds is 475, and the worst seed has 296.
