@@ -181,7 +181,7 @@ assert error < 1e-6
 #
 # A count of updates is the first update whose mean return reaches 400: the median of 32 seeds, of 150 updates each.
 #
-# 1. 72 updates in place of 42. Two of the 32 seeds never reach 400.
+# 1. Without a baseline, 72 updates in place of 42. Two of the 32 seeds never reach 400.
 # 2. By $(N - 1) / N$, here 15/16: $G_n$ less the mean of all is $(N - 1) / N$ times $G_n$ less the mean of the others.
 # 3. With 1: 40 updates, no clear difference. With 0.9: 67 updates, and 8 of 32 seeds never reach 400. An action looks
 #    only some 10 steps ahead, and a pole takes longer to fall. Later the seeds fall back, to a mean of 254.
