@@ -50,8 +50,9 @@ class Conductor(Observer[Training]):
         for part in prepared.parts:
             if left := [x for x in part.chunks if not (files is not None and files.has(x.name))]:
                 self._stages.append((part, left))
-        #: Runs that have ended here, of how many.
-        self._done, self._total = 0, sum(len(x.seed) for _, left in self._stages for x in left)
+        #: Runs that have ended here, what checkpoints brought of them, and of how many.
+        self._done, self._brought = 0, 0.0
+        self._total = sum(len(x.seed) for _, left in self._stages for x in left)
         #: The programs of the group that is next.
         self._next: Future[Compiled] = Future()
 
@@ -96,11 +97,15 @@ class Conductor(Observer[Training]):
             observer.finished(driver, summary)
         return driver, summary
 
+    def began(self, driver: Training) -> None:
+        """Remembers how far a sweep's runs are that go on."""
+        self._brought += np.minimum(driver.record.used(), 1.0).sum()
+
     def updated(self, driver: Training, met: np.ndarray) -> None:
         """Shows how far a sweep is."""
-        done = (self._done + np.minimum(driver.record.used(), 1.0).sum()) / self._total
-        left = self._clock.running() * (1 - done) / done if done > 0 else float("nan")
-        now = driver.record.progress()._replace(fraction=float(done), seconds_left=left)
+        done = self._done + np.minimum(driver.record.used(), 1.0).sum()
+        fraction, gained = float(done / self._total), float(done - self._brought) / self._total
+        now = driver.record.measure(fraction, driver.seconds(), gained, self._clock.running())
         self._display.show_progress(now)
 
     def _compile(self, part: Part) -> Compiled:

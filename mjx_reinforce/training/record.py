@@ -76,17 +76,17 @@ def used(config: Config, env_steps: np.ndarray, updates: np.ndarray) -> np.ndarr
 
 
 class Progress(NamedTuple):
-    """How far a run is, as of its last evaluation.
+    """How far runs are, such as the seeds of one, and what their last evaluation returned.
 
-    fraction: how much of their budgets the seeds have used, in the mean
-    updates: made by the seed that made the most
-    env_steps: of the mean seed
-    iqm: interquartile mean of the return over seeds, NaN where failed seeds reach the middle half
-    worst: the return of the worst seed, NaN if one failed
-    failed: how many seeds have a return that is not finite
+    fraction: how much of their budgets they have used, in the mean
+    updates: made by the one that made the most
+    env_steps: of the mean one
+    iqm: interquartile mean of the returns, NaN where failed ones reach the middle half
+    worst: the lowest return, NaN if one failed
+    failed: how many returns are not finite
     num_seeds: of how many
-    env_steps_per_second: of all seeds together, the mean since the start
-    seconds_left: estimated from the latest blocks, NaN before the first
+    env_steps_per_second: of all together, the mean since the start
+    seconds_left: an estimate, NaN before the first block
     """
 
     fraction: float
@@ -98,31 +98,6 @@ class Progress(NamedTuple):
     num_seeds: int
     env_steps_per_second: float
     seconds_left: float
-
-
-def measure_progress(past: dict[str, np.ndarray], used: np.ndarray) -> Progress:
-    """Returns how far a run is.
-
-    Args:
-      past: its last E evaluations, at most ``BLOCKS`` + 1: ``eval_return``, ``env_steps`` and
-        ``updates`` [E, S], and ``seconds`` [E] since compilation ended.
-      used: [E, S] the fraction of its budget that each seed had used.
-    """
-    returns, seconds = past["eval_return"][-1], past["seconds"]
-    fractions, passed = np.minimum(used, 1.0).mean(axis=-1), seconds[-1] - seconds[0]
-    total, fraction = past["env_steps"][-1].sum(), float(fractions[-1])
-    progressed = fraction - float(fractions[0])
-    return Progress(
-        fraction=fraction,
-        updates=int(past["updates"][-1].max()),
-        env_steps=float(past["env_steps"][-1].mean()),
-        iqm=float(iqm(returns)),
-        worst=float(returns.min()),
-        failed=int(np.sum(~np.isfinite(returns))),
-        num_seeds=len(returns),
-        env_steps_per_second=float(total / seconds[-1]) if seconds[-1] > 0 else math.nan,
-        seconds_left=float((1 - fraction) * passed / progressed) if progressed > 0 else math.nan,
-    )
 
 
 #: Why a run that is ``hopeless`` is stopped.
@@ -141,7 +116,7 @@ def nonfinite_updates(metrics: Arrays) -> np.ndarray:
     """Returns how many updates of a block met numbers which are not finite, of each seed [S].
 
     Args:
-      metrics: [K, S] each, as for ``Record.add``.
+      metrics: [K, S] each, as in ``Measured``.
     """
     broken = (metrics["nonfinite_episodes"] > 0) | (metrics["skipped_update"] > 0)
     return (broken & metrics["active"]).sum(axis=0)
@@ -154,7 +129,7 @@ def broken_in_a_row(before: np.ndarray, metrics: Arrays) -> np.ndarray:
 
     Args:
       before: [S] the same before this block.
-      metrics: [K, S] each, as for ``Record.add``.
+      metrics: [K, S] each, as in ``Measured``.
     """
     broken = metrics["nonfinite_episodes"] >= metrics["episodes"]
     broken |= metrics["skipped_update"] > 0
@@ -240,19 +215,16 @@ class Record:
     env_steps: [R] int64, how many each has played in training
     nonfinite: [R] int64, how many of its updates met numbers that are not finite
     lengths: [R] int64, of a sweep, the steps of all episodes of each run's latest evaluation
-    seconds: wall time from the end of compilation to the policies that were evaluated last
     """
 
     #: What a checkpoint has besides the tables.
-    _kept: tuple[str, ...] = ("updates", "env_steps", "nonfinite", "lengths", "seconds")
+    _kept: tuple[str, ...] = ("updates", "env_steps", "nonfinite", "lengths")
 
     def __init__(self, config: Config):
         """Begins before the first update; R is ``config.num_seeds``."""
         self.config = config
-        self.updates, self.env_steps, self.nonfinite, self.lengths = (
-            np.zeros(config.num_seeds, np.int64) for _ in range(4)
-        )
-        self.seconds = 0.0
+        counts = np.zeros((4, config.num_seeds), np.int64)
+        self.updates, self.env_steps, self.nonfinite, self.lengths = counts
         self._tables = {"evaluations": GrowingTable({})}
 
     def arrays(self) -> Arrays:
@@ -317,13 +289,11 @@ class Record:
             returns, env_steps = last["eval_return"][0].copy(), last["env_steps"][0].copy()
         returns[runs], env_steps[runs] = looked["eval_return"][made], self.env_steps[runs]
         self.lengths[runs] = looked["eval_steps"][made]
-        self._append(seconds, eval_return=returns, env_steps=env_steps, updates=self.updates)
+        self._append(eval_return=returns, env_steps=env_steps)
         return {}
 
-    def _append(self, seconds: float, **row: np.ndarray) -> None:
-        """Adds the row [R] of an evaluation."""
-        self.seconds = seconds
-        row["seconds"] = np.asarray(seconds, np.float64)
+    def _append(self, **row: np.ndarray) -> None:
+        """Adds the row of an evaluation, such as [R]."""
         self._tables["evaluations"].append({name: x[None].copy() for name, x in row.items()})
 
     def add_updates(self, measured: "Measured") -> np.ndarray:
@@ -340,11 +310,27 @@ class Record:
         """Returns which runs [R] have not used their budget, and how long their episodes are."""
         return self.used() < 1.0, self.lengths
 
-    def progress(self) -> Progress:
-        """Returns how far the runs are, as of their last evaluation."""
-        names = ("eval_return", "env_steps", "updates", "seconds")
-        past = self._tables["evaluations"].latest(BLOCKS + 1, *names)
-        return measure_progress(past, used(self.config, past["env_steps"], past["updates"]))
+    def measure(self, fraction: float, seconds: float, gained: float, passed: float) -> Progress:
+        """Returns how far the runs are.
+
+        Args:
+          fraction: how much of their budgets they have used.
+          seconds: in which they did that.
+          gained: the part of the fraction from which the time left is estimated.
+          passed: seconds in which that was gained.
+        """
+        returns = self._tables["evaluations"].latest(1, "eval_return")["eval_return"][0]
+        return Progress(
+            fraction=fraction,
+            updates=int(self.updates.max()),
+            env_steps=float(self.env_steps.mean()),
+            iqm=float(iqm(returns)),
+            worst=float(returns.min()),
+            failed=int(np.sum(~np.isfinite(returns))),
+            num_seeds=len(returns),
+            env_steps_per_second=float(self.env_steps.sum() / seconds) if seconds > 0 else math.nan,
+            seconds_left=(1 - fraction) * passed / gained if gained > 0 else math.nan,
+        )
 
     def history(self) -> Arrays:
         """Returns what the evaluations measured, [E, R] each.
@@ -375,8 +361,7 @@ class RunRecord(Record):
         """
         super().__init__(config)
         self.threshold, num_seeds = threshold, config.num_seeds
-        self.episodes = np.zeros(num_seeds, np.int64)
-        self.broken_in_a_row = np.zeros(num_seeds, np.int64)
+        self.episodes, self.broken_in_a_row = np.zeros((2, num_seeds), np.int64)
         self.simulated = self.evaluated = 0
         kinds = {"episode_return": np.float32, "env_steps": np.int64, "episodes": np.int64}
         first = {name: np.zeros((0, num_seeds), kind) for name, kind in kinds.items()}
@@ -444,10 +429,18 @@ class RunRecord(Record):
         """
         looked, seeds = measured.looked, self.config.first_seed + np.arange(len(self.updates))
         counts = {"env_steps": self.env_steps, "episodes": self.episodes}
-        self._append(seconds, **looked, **counts, updates=self.updates)
+        self._append(**looked, **counts, updates=self.updates, seconds=np.float64(seconds))
         self.add_test(looked)
         counts |= {"seed": seeds, "update": self.updates}
         return as_cells(self._last | looked | counts, seconds)
+
+    def progress(self) -> Progress:
+        """Returns how far the run is, right after an evaluation."""
+        past = self._tables["evaluations"].latest(BLOCKS + 1, "env_steps", "updates", "seconds")
+        counted = used(self.config, past["env_steps"], past["updates"])
+        fractions = np.minimum(counted, 1.0).mean(axis=-1).tolist()
+        now, seconds = fractions[-1], past["seconds"].tolist()
+        return self.measure(now, seconds[-1], now - fractions[0], seconds[-1] - seconds[0])
 
     def add_test(self, looked: Arrays) -> None:
         """Counts what an evaluation or a test simulated, of ``block.evaluate``."""

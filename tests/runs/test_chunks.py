@@ -54,13 +54,11 @@ def test_measurements_add_up():
     assert record.updates.tolist() == [0, 4, 0, 2]
 
 
-def test_progress_is_as_of_the_last_evaluations():
+def test_progress_is_what_the_runs_have_made_and_last_returned():
     record = filled()
-    now = record.progress()
+    now = record.measure(0.5, seconds=2.5, gained=0.25, passed=3.0)
     assert record.used().tolist() == pytest.approx([0, 0.6, 0, 1.3])
-    assert (now.updates, now.env_steps, now.num_seeds) == (2, 50 / 4, 4)
-    assert now.worst == 1
-    assert now.env_steps_per_second == pytest.approx(50 / 2.5)
+    assert now == (0.5, 4, 190 / 4, now.iqm, 1, 0, 4, 190 / 2.5, 6)
 
 
 def test_a_record_is_restored():
