@@ -16,7 +16,7 @@ from mjx_reinforce.engine.memory import host_memory
 from mjx_reinforce.registry import is_own
 from mjx_reinforce.reports.experiment import counted
 from mjx_reinforce.runs.design import Design
-from mjx_reinforce.settings.config import MAX_COUNT, Config, marked
+from mjx_reinforce.settings.config import MAX_COUNT, Config, is_read, marked
 from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.defaults import num_cores
 from mjx_reinforce.settings.groups import Reader
@@ -156,7 +156,10 @@ def _prepare_sweep(design: Design, known: Mapping[str, Any]) -> tuple[list[Part]
     parts = []
     for number, group in enumerate(make_groups(design)):
         config, traced = group.config, tuple(group.settings)
-        ready = get_ready(config, config, division=division, traced=traced)
+        chosen = vars(config).keys() & {*design.given, *design.over}
+        unset = {name: None for name in chosen if is_read(name, config)}
+        default: Any = dataclasses.replace(config, **unset)
+        ready = get_ready(config, default, division=division, traced=traced)
         part, limit = Part(group, ready, 0, 0, []), design.chunk_runs
         if known:
             limit = known["chunk_runs"][number]
@@ -302,5 +305,5 @@ def _where(division: Division) -> str:
     if here == 1:
         return counted(num_cores(), "CPU core") if kind == "cpu" else f"one {kind}"
     shared = "seeds" if division.seeds > 1 else "episodes of an update"
-    which = f", which share the {shared}," if division.count > 1 else ""
+    which = f", which share the {shared}" if division.count > 1 else ""
     return f"{division.count} of the {here} devices here ({kind}){which}"

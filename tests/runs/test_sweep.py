@@ -429,6 +429,8 @@ def test_numbers_share_a_program_and_the_rest_does_not():
         ("--over seed 1 2", "cannot go over seed"),
         ("--over value-learning-rate 1e-3 1e-2", "would do nothing"),
         ("--over learning-rate 1e-2 1e-3 --value-fits 3", "--value-fits 3 would do nothing"),
+        ("--env CartPole-v1 --over initial-std 0.1 0.5", "--initial-std 0.1 would do nothing"),
+        ("--env CartPole-v1 --initial-std 0.3 --over learning-rate 1 2", "-std 0.3 would do"),
         ("--over learning-rate 1e-2 1e-3 --chunk-runs 0", "--chunk-runs must be at least 1"),
         ("--over learning-rate 1e-2 1e-3 --log wandb", "--log logs a run"),
         ("--update natural-gradient --over max-kl None 0.1", "from --max-kl, which is None"),
