@@ -429,7 +429,7 @@ class RunRecord(Record):
         """
         looked, seeds = measured.looked, self.config.first_seed + np.arange(len(self.updates))
         counts = {"env_steps": self.env_steps, "episodes": self.episodes}
-        self._append(**looked, **counts, updates=self.updates, seconds=np.float64(seconds))
+        self._append(**looked, **counts, updates=self.updates, seconds=np.array(seconds))
         self.add_test(looked)
         counts |= {"seed": seeds, "update": self.updates}
         return as_cells(self._last | looked | counts, seconds)
