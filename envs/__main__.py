@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class EnvsSettings:
-    """List the tasks, or describe one: its sizes, its rules and its default settings."""
+    """List the tasks, or describe one: its sizes and its rules."""
 
     env: tyro.conf.Positional[str | None] = None
     """The task to describe, an id or module:Class for your own; all are listed if not given."""
@@ -61,7 +61,7 @@ def about_task(id: str) -> str:
 
   {train}
 
---minutes M sets a time in place of a number of env steps; --help shows its default settings."""
+--minutes M sets a time in place of a number of env steps; with --help, it shows its defaults."""
     return "\n\n".join([id, _sizes(env), *said, *_settings(env), how])
 
 

@@ -45,6 +45,8 @@ def main() -> None:
 
 def _report(settings: ReportSettings) -> None:
     """Writes a report, and says where it is."""
+    if settings.output is not None:
+        check_page(settings.output, settings.overwrite)
     experiment = sources.read_experiment(settings.sources)
     output = settings.output or _default_output(settings.sources)
     check_page(output, settings.overwrite)
@@ -63,7 +65,9 @@ def check_page(output: Path, overwrite: bool) -> None:
     """Raises ValueError if the report cannot be written there, or would replace files unasked."""
     check_output(output, overwrite, ".html", ".htm")
     beside = _beside(output)
-    if beside.exists() and not overwrite:
+    if beside.exists() and not beside.is_dir():
+        raise ValueError(f"{beside} is in the way of the pictures; choose another --output")
+    if beside.is_dir() and any(beside.iterdir()) and not overwrite:
         raise ValueError(f"{beside} exists; pass --overwrite or another --output")
 
 

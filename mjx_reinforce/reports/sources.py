@@ -73,6 +73,12 @@ def read_experiment(sources: Sequence[Path]) -> Experiment:
         )
     joined = _join_shares(found)
     configurations = _told_apart(joined)
+    for other in configurations[1:]:
+        if not np.intersect1d(configurations[0].seed, other.seed).size:
+            raise ValueError(
+                f"{configurations[0].label} and {other.label} have no seed in common, so they "
+                "cannot be compared; give equal --seeds, or the settings of one run"
+            )
     thresholds = [source.threshold for source in found if source.threshold is not None]
     provenance, disagree = _merge_provenance(found)
     timings = sum((Counter(source.timings) for source in found), Counter())

@@ -92,7 +92,7 @@ def headline(findings: Findings) -> list[str]:
         first = f"The best is {name}: it ended with {mean}."
     said = [first, *_ahead(findings), *_solving(findings), *_few(findings)]
     speed = _speed(findings)
-    if speed and len(ties) == len(of_best(findings)):
+    if speed and ties and len(ties) == len(of_best(findings)):
         return [f"{speed}; the final returns are a tie.", *said]
     return [*said, f"{speed}."] if speed else said
 
@@ -117,17 +117,18 @@ def _ahead(findings: Findings) -> Iterator[str]:
     )
     if ties:
         least = p_value(min(each.adjusted for each in ties))
+        one, other = (findings.results[k].configuration.seed for k in ties[0][:2])
+        seeds, why = np.intersect1d(one, other).size, "chance often makes a difference as large"
+        if len(findings.comparisons) * 2.0 ** (1 - seeds) >= LEVEL:
+            why = f"{counted(seeds, 'seed')} are too few to tell"
         least += "" if least == "p = 1" else " or more"
         names = _listed([findings.labels[each.second] for each in ties])
-        yield (
-            f"The best cannot be told from {names}: chance often makes a difference as large "
-            f"({least})."
-        )
+        yield f"The best cannot be told from {names}: {why} ({least})."
 
 
 def _listed(names: list[str]) -> str:
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return ", ".join(f"“{name}”" for name in names[:3]) + more
+    return ", ".join(f'"{name}"' for name in names[:3]) + more
 
 
 def _solving(findings: Findings) -> Iterator[str]:

@@ -4,6 +4,7 @@ import dataclasses
 import gc
 import shlex
 import sys
+import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -16,9 +17,11 @@ from mjx_reinforce.console.streams import accept_everything, say_error, silence_
 from mjx_reinforce.runs.design import Design, SweepSettings, check_swept, read_design, read_over
 from mjx_reinforce.runs.directory import locked
 from mjx_reinforce.settings.config import (
+    CODE,
     Config,
     check_named,
     code_flags,
+    is_own,
     read_seeds,
 )
 from mjx_reinforce.settings.defaults import PRESETS, flag_value, for_arguments, named_code
@@ -81,8 +84,16 @@ def parse(arguments: Sequence[str], name: str = "train") -> Design:
     known = read_design(base.resume)
     directory, own = base.resume, known.base
     base, sweep = _read(name, flags, own, prog)
-    if known.over and (base, sweep) != (own, SweepSettings()):
-        raise ValueError(f"the sweep in {directory} goes on as it is: give --resume alone")
+    over = read_over(sweep.over)
+    as_before = over in ({}, known.over) and sweep == SweepSettings(over=sweep.over)
+    if not as_before or (known.over and base != own):
+        what = "sweep" if known.over else "run"
+        raise ValueError(f"the {what} in {directory} goes on as it is: give --resume alone")
+    if not over and any(is_own(x) for name in CODE for x in known.over.get(name, ())):
+        raise ValueError(
+            f"{directory} compares code of your own, and this would run that code; if you trust "
+            "it, repeat the sweep's --over"
+        )
     resume.check_settings(own, base)
     if not known.over and resume.is_done(own, base):
         print(
@@ -218,8 +229,9 @@ def _train(name: str, interrupt: Interrupt) -> int:
     except ImportError as error:
         refuse(cannot_load(error))
     except ValueError as error:
-        if outcome is None and interrupt.deferred():
-            raise  # in training: it is a mistake of this program
+        *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+        if outcome is None and not frame.f_globals["__name__"].startswith("mjx_reinforce"):
+            raise  # of a library, in training: it is a mistake of this program
         refuse(str(error))
     except (RuntimeError, MemoryError, OSError) as error:
         _refuse_full(error, design)
@@ -256,7 +268,9 @@ def report_on(outcome: "Outcome", *, report: bool = True) -> None:
     display, directory, summary = outcome.display, outcome.directory, outcome.summary
     assert directory is not None
     if "over" not in summary:
-        display.show_summary(summary, directory)
+        config = vars(outcome.driver.config) if outcome.driver else {}
+        own = {name: config[name] for name in ("env", "policy") if name in config}
+        display.show_summary(summary, directory, code_flags(config), code_flags(own))
         return
     if summary["status"] == "interrupted":
         flags = code_flags(summary["settings"])

@@ -125,7 +125,7 @@ def read_design(directory: Path) -> Design:
         return Design(base=dataclasses.replace(base, resume=directory))
     path = directory / "sweep.json"
     with naming_damage(path):
-        settings, exact = record["settings"], record["exact"]
+        settings, exact = dict(record["settings"]), record["exact"]
         over = {
             name: [tuple(x) if isinstance(x, list) else x for x in values]
             for name, values in record["over"].items()

@@ -86,9 +86,9 @@ def own_directory(directory: Path, interrupt: Interrupt, *, resumed: bool) -> It
         _try_to_write(directory)
     except OSError as error:
         remove_empty(made)
+        remedy = "make room there" + ("" if resumed else ", or choose another --output")
         raise ValueError(
-            f"cannot write to the run directory {directory} ({error.strerror}); make room there, "
-            "or choose another --output"
+            f"cannot write to the run directory {directory} ({error.strerror}); {remedy}"
         ) from error
     with locked(directory):  # a folder in which another trains stays
         interrupt.on_exit(lambda: remove_empty(made))

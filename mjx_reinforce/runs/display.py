@@ -17,7 +17,6 @@ from rich.text import Text
 
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.streams import heartbeat
-from mjx_reinforce.settings.config import code_flags
 from mjx_reinforce.statistics import enough, iqm
 from mjx_reinforce.training import record
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer
@@ -92,15 +91,23 @@ class Display(Observer[Driver]):
         for purpose, line in commands.items():
             self.say(f"{purpose}:  {line}", whole=True)
 
-    def show_summary(self, summary: dict[str, Any], directory: Path) -> None:
-        """Says what a run learned, where its files are, and what can be done with them."""
+    def show_summary(
+        self, summary: dict[str, Any], directory: Path, again: str = "", own: str = ""
+    ) -> None:
+        """Says what a run learned, where its files are, and what can be done with them.
+
+        Args:
+          summary: of summary.json.
+          directory: of the run.
+          again: the flags that name the user's code where the run goes on.
+          own: those of them that its policies need.
+        """
         self.say(summary_table(summary))
-        own = code_flags({"env": summary["env"]})
+        where = shlex.quote(str(directory))
         if summary["status"] == "interrupted":
-            self.say(f"Interrupted: go on with --resume {directory}{own}", whole=True)
+            self.say(f"Interrupted: go on with --resume {where}{again}", whole=True)
             return
         self.say(f"Files in {directory}; the picture is learning_curve.png.")
-        where = shlex.quote(str(directory))
         self.show_commands(
             {
                 "To see the best seed play": f"{command('watch')} {where}{own}",

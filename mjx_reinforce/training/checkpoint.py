@@ -13,7 +13,7 @@ import re
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,6 +35,7 @@ class Checkpoint(NamedTuple):
     env_steps: the budget of a seed, or None
     max_updates: the other budget, or None
     number: its place among the run's checkpoints, once it is saved
+    settings: of the run, without its budget
     """
 
     layout: str
@@ -46,6 +47,7 @@ class Checkpoint(NamedTuple):
     env_steps: int | None
     max_updates: int | None
     number: int = 0
+    settings: dict[str, Any] | None = None
 
     def is_even(self, eval_every: int) -> bool:
         """Returns whether no budget has stopped a seed yet, nor cut a block short.

@@ -13,6 +13,7 @@ from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.record import Cells, Record, RunRecord
+from mjx_reinforce.training.resume import decisive
 from mjx_reinforce.training.slots import Measured, Slots
 from mjx_reinforce.training.state import Best, StateRows, first_best, keep_best
 
@@ -151,6 +152,7 @@ class Training:
             metrics_bytes=0,
             env_steps=config.env_steps,
             max_updates=config.max_updates,
+            settings=decisive(config),
         )
 
     def seconds(self) -> float:

@@ -71,6 +71,11 @@ def recordable(config: Config) -> dict[str, Any]:
     return json.loads(json.dumps(settings))
 
 
+def decisive(config: Config) -> dict[str, Any]:
+    """Returns the settings that a run cannot change when it goes on."""
+    return {name: value for name, value in recordable(config).items() if name not in BUDGETS}
+
+
 def check_settings(known: Config, asked: Config) -> None:
     """Raises ValueError if more than the budget of a run is to change.
 
@@ -149,7 +154,8 @@ def newest_checkpoint(config: Config, say: Callable[[str], None]) -> "Checkpoint
       say: shows a line about each file that does not serve.
 
     Raises:
-      ValueError: the budget is smaller than what the run did, or a checkpoint is another version's.
+      ValueError: the budget is smaller than what the run did, config.json was edited, or a
+        checkpoint is another version's.
     """
     from mjx_reinforce.training import checkpoint
 
@@ -157,6 +163,12 @@ def newest_checkpoint(config: Config, say: Callable[[str], None]) -> "Checkpoint
     metrics = config.resume / "metrics.csv"
     length = metrics.stat().st_size if metrics.exists() else 0
     for found in checkpoint.read_checkpoints(config.resume / "checkpoint", say):
+        for name, value in (found.settings or {}).items():
+            if (said := decisive(config).get(name)) != value:
+                raise ValueError(
+                    f"{config.resume}/config.json says that {name} is {said}, but the run was "
+                    f"trained with {value}; put that back, or start another run"
+                )
         if found.metrics_bytes > length:
             say(f"metrics.csv is shorter than at checkpoint {found.number}; trying the one before")
         elif _serves(found, config):

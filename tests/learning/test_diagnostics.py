@@ -12,11 +12,10 @@ from problems import MASK, PARAMS, make_problem
 from scipy import stats
 from toys import Survive, Target, categorical
 
-from mjx_reinforce import Trajectory, mlp_policy, normal, reinforce, train_step
+from mjx_reinforce import Trajectory, mlp_policy, normal, reinforce
 from mjx_reinforce.learning import diagnostics, normalize, updates
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.published import variants
-from mjx_reinforce.published.ars import ars
 
 
 def make_trajectory(lengths, horizon, poison=0.0):
@@ -165,20 +164,3 @@ def test_a_change_without_a_kl_is_kept_as_it_is():
     broken = jax.tree.map(lambda x: x * jnp.nan, actor.params)
     kept = diagnostics.within_kl(policy, actor, broken, visited, 0.01)
     assert all(np.isnan(x).all() for x in jax.tree.leaves(kept))  # for ``keep_finite`` to see
-
-
-@pytest.mark.slow
-def test_a_search_has_the_noise_of_its_directions_alone():
-    learner = ars(Target(), num_directions=5)
-    state = jax.jit(learner.init)(jax.random.key(0))
-    play_key = jax.random.split(state.key, 3)[1]
-    trial = jax.jit(learner.play)(state, play_key, True)
-    returns = np.sum(np.asarray(trial.trajectory.reward), axis=0).reshape(2, 5)
-    difference = returns[0] - returns[1]
-    leaves = [np.asarray(x).reshape(5, -1) for x in jax.tree.leaves(trial.directions)]
-    each = difference[:, None] * np.concatenate(leaves, axis=1)
-    noise = np.sum(np.var(each, axis=0, ddof=1)) / 5
-    metrics = train_step(learner, state)[1]
-    expected = np.sum(each.mean(axis=0) ** 2) / noise - 1
-    assert float(metrics["gradient_snr"]) == pytest.approx(expected, rel=1e-3)
-    assert not metrics.keys() & {"kl", "policy_std", "explained_variance", "clipped_gradients"}

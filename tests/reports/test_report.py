@@ -364,5 +364,5 @@ def test_no_column_is_cut_at_any_width(tmp_path, over):
 def test_in_a_browser(written):
     """The slider moves the histograms, a curve says what it is, and choices show what is chosen."""
     charts, shown, told, width = in_browser(written[1], _script("used"))
-    assert (charts, shown, width) == (7, 4, 390)
+    assert (charts, shown, width) == (6, 4, 390)
     assert any(label in told for label in content(written[1])["labels"])

@@ -62,7 +62,7 @@ def test_what_is_surely_slower_is_named_where_two_are_equally_fast(tmp_path):
     directory = make_sweep(tmp_path / "sweep", num_seeds=24, over=RATES)
     all_solve(directory, [6, 2, 2])
     said = words.headline(findings_of(directory))
-    slower = "faster than “learning rate 0.001”"
+    slower = 'faster than "learning rate 0.001"'
     assert said[0] == f"learning rate 0.01 is surely {slower}; the final returns are a tie."
 
 

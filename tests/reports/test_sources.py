@@ -64,6 +64,9 @@ def test_shares_of_a_sweep_are_one_sweep(tmp_path):
 def test_shares_that_do_not_fit_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"b and .*a have seed 2 in common, with equal settings"):
         sources.read_experiment(make_shares(tmp_path, second=2))
+    other = make_measured_run(tmp_path / "c", num_seeds=2, seeds="7:9", first=7, learning_rate=0.5)
+    with pytest.raises(ValueError, match=r"learning rate 0\.5 have no seed in common"):
+        sources.read_experiment([tmp_path / "a", other])
 
 
 def test_a_run_that_goes_on_is_read_so_far(tmp_path):

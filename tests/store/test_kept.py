@@ -133,7 +133,7 @@ def test_a_program_that_launches_a_gpus_kernel_is_kept(monkeypatch):
     monkeypatch.setattr(gpu, "_assemblers", lambda: ((), None))
 
     def add(x):
-        return gpu._call(kernel, (1, 1), [jnp.ones(1, jnp.int32)], [x])
+        return gpu._call(kernel, (1, 1), [jnp.ones(1, jnp.int32)], [x], [x])
 
     place = cache.Cache.find()
     place.keep("key", add, (jax.ShapeDtypeStruct((1,), np.int32),))

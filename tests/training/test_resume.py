@@ -238,6 +238,8 @@ REFUSED = [
     ("--max-updates 13", {}, "--max-updates 13 is less than the 20"),
     ("", {"device": "TPU"}, "was begun with device TPU"),
     ("", {"packages": {"jax": "0.1"}}, "was begun with jax 0.1"),
+    ("", {"learning_rate": 0.5}, "learning_rate is 0.5, but the run was trained with 0.01"),
+    ("", {"hidden_sizes": [8]}, "hidden_sizes is [8], but the run was trained with [4]"),
     ("", {"one_start": True}, "has other settings (one_start): it is damaged, or of another"),
     ("", {"eval_every": None}, "eval_every is None: it is damaged, or of another version of the"),
     ("", {"engine": "kernel"}, "engine is 'kernel': it is damaged"),

@@ -1,14 +1,15 @@
 """Our engines, as `python -m experiments.speed.benchmark` times them."""
 
 import dataclasses
-import functools
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
+from mujoco import mjx
 
 from experiments.speed.benchmark.rows import Candidate
 from mjx_reinforce import Actor, act, envs, mlp_policy, reinforce
@@ -17,8 +18,8 @@ from mjx_reinforce.engine.play.choice import ActingPolicy, choose
 from mjx_reinforce.learning import normalize
 from mjx_reinforce.learning.distributions import default_distribution
 
-#: Name in the table -> engine, and arguments of the environment.
-ENGINES = {"plain MJX": ("vmap", {"solver": "mjx"}), "native": ("native", {})}
+#: Name in the table -> engine.
+ENGINES = {"plain MJX": "vmap", "native": "native"}
 
 
 @struct.dataclass
@@ -64,15 +65,18 @@ def rollout_of(
     env_id: str, name: str, steps: int, precision: str = "float32"
 ) -> Callable[[int], Candidate]:
     """Makes the machine code of a rollout; returns what compiles a program of so many episodes."""
-    engine_name, arguments = ENGINES[name]
-    env = Loop(envs.make(env_id, **arguments), steps)
+    task: Any = envs.make(env_id)
+    if name == "plain MJX":
+        task._forward = partial(mjx.forward, task.model)
+        task._physics_step = partial(mjx.step, task.model)
+    env = Loop(task, steps)
     size = observation_size(env)
     network = mlp_policy(size, default_distribution(action_space(env)), (16, 32))
     actor = Actor(params=network.init(jax.random.key(0)), normalizer=normalize.init(size))
-    play_act = functools.partial(act, network)
+    play_act = partial(act, network)
     began = time.perf_counter()
     policy = ActingPolicy(play_act, actor, network.distribution)
-    engine = choose(engine_name, env, policy, steps)
+    engine = choose(ENGINES[name], env, policy, steps)
     choosing = time.perf_counter() - began  # machine code is made here
 
     def of(batch: int) -> Candidate:
@@ -89,11 +93,10 @@ def rollout_of(
 
 def training(env_id: str, name: str, batch: int, steps: int) -> Candidate:
     """Whole updates of a 64-64 policy in float32: rollout, estimator, gradient and optimizer."""
-    engine_name, arguments = ENGINES[name]
-    env = Loop(envs.make(env_id, **arguments), steps)
+    env = Loop(envs.make(env_id), steps)
     policy = mlp_policy(observation_size(env), default_distribution(action_space(env)), (64, 64))
     began = time.perf_counter()
-    learner = reinforce(env, policy=policy, num_episodes=batch, engine=engine_name)
+    learner = reinforce(env, policy=policy, num_episodes=batch, engine=ENGINES[name])
     choosing = time.perf_counter() - began
     state = learner.init(jax.random.key(0))
 

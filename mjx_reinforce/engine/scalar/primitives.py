@@ -20,7 +20,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
-from jax.interpreters import batching
+from jax.interpreters import ad, batching
 
 from mjx_reinforce.engine.base import PyTree
 from mjx_reinforce.engine.scalar import jaxprs
@@ -87,6 +87,12 @@ def _batched_skippable(operands: Sequence[Any], axes: Sequence[int | None], **pa
     return results, [0] * len(results)
 
 
+def _derivative_of_skippable(primals: Any, tangents: Any, **params: Any) -> tuple:
+    plain = functools.partial(_plain_skippable, **params)
+    return jax.jvp(plain, tuple(primals), tuple(map(ad.instantiate_zeros, tangents)))
+
+
+ad.primitive_jvps[_SKIPPABLE] = _derivative_of_skippable
 _SKIPPABLE.def_abstract_eval(lambda *_, computation, **__: computation.out_avals)
 batching.primitive_batchers[_SKIPPABLE] = _batched_skippable
 

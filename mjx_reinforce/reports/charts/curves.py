@@ -10,7 +10,7 @@ from mjx_reinforce.reports import charts
 from mjx_reinforce.reports.charts import Table, short, stacked
 from mjx_reinforce.reports.findings import Findings, Result, from_the_worst, on_grid
 from mjx_reinforce.reports.words import number
-from mjx_reinforce.statistics import iqm, iqm_interval
+from mjx_reinforce.statistics import enough, iqm, iqm_interval
 
 #: Seeds that are drawn one by one: of one configuration, and of all together.
 _DRAWN_OF_ONE = 40
@@ -72,8 +72,10 @@ def picture(env: str, threshold: float | None, history: dict[str, np.ndarray]) -
         axes.fill_between(grid, *iqm_interval(curves), color="tab:blue", alpha=0.25, linewidth=0)
     known = returns[np.isfinite(returns)]
     if threshold is not None and known.size and known.min() <= threshold <= known.max():
-        axes.axhline(threshold, color="0.3", linestyle="--", linewidth=1)
-    shown = f"interquartile mean of {seeds} seeds and its 95 % interval" if seeds > 1 else "1 seed"
+        axes.axhline(threshold, color="0.3", linestyle="--", linewidth=1, label="solved")
+        axes.legend(frameon=False)
+    shown = f"interquartile mean of {seeds} seeds" if seeds > 1 else "1 seed"
+    shown += " and its 95 % interval" if enough(seeds) else ""
     axes.set(title=f"{env}: {shown}", xlabel="env steps per seed", ylabel=_RETURN)
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.grid(alpha=0.3)

@@ -253,6 +253,15 @@ def test_the_unroll_of_a_scan_means_what_it_means_to_jax():
     assert [sines(lambda x, n=n: total(x, unroll=n), 7) for n in each] == [1, 1, 1, 7, 7]
 
 
+def test_what_may_be_skipped_has_its_derivative_where_it_is_written_out():
+    def cube(x):
+        return scalar.skippable(x != 0, lambda: x**3, 0 * x)
+
+    x = jnp.array([-1.0, 0.0, 2.0])
+    for mapped in (jax.vmap, scalar.vmap):
+        np.testing.assert_allclose(mapped(jax.grad(cube))(x), 3 * x**2)
+
+
 def test_platform_dependent_takes_its_default():
     """Documented: what is written out does not depend on where it will run."""
 
