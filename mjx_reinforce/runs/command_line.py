@@ -87,8 +87,7 @@ def parse(arguments: Sequence[str], name: str = "train") -> Design:
     over = read_over(sweep.over)
     as_before = over in ({}, known.over) and sweep == SweepSettings(over=sweep.over)
     if not as_before or (known.over and base != own):
-        what = "sweep" if known.over else "run"
-        raise ValueError(f"the {what} in {directory} goes on as it is: give --resume alone")
+        raise ValueError(f"what is in {directory} goes on as it is: give --resume alone")
     if not over and any(is_own(x) for name in CODE for x in known.over.get(name, ())):
         raise ValueError(
             f"{directory} compares code of your own, and this would run that code; if you trust "
@@ -230,7 +229,8 @@ def _train(name: str, interrupt: Interrupt) -> int:
         refuse(cannot_load(error))
     except ValueError as error:
         *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-        if outcome is None and not frame.f_globals["__name__"].startswith("mjx_reinforce"):
+        ours = frame.f_globals.get("__name__", "").startswith("mjx_reinforce")
+        if outcome is None and interrupt.deferred() and not ours:
             raise  # of a library, in training: it is a mistake of this program
         refuse(str(error))
     except (RuntimeError, MemoryError, OSError) as error:
