@@ -15,7 +15,7 @@ from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.streams import accept_everything, say_error, silence_alarms
 from mjx_reinforce.runs.design import Design, SweepSettings, check_swept, read_design, read_over
-from mjx_reinforce.runs.directory import locked
+from mjx_reinforce.runs.perform import Outcome, locked, perform
 from mjx_reinforce.settings.config import (
     CODE,
     Config,
@@ -31,7 +31,6 @@ from mjx_reinforce.training import resume
 
 if TYPE_CHECKING:
     from mjx_reinforce.report import WrittenReport
-    from mjx_reinforce.runs.perform import Outcome
 
 
 _TRAIN = (
@@ -221,8 +220,6 @@ def _train(name: str, interrupt: Interrupt) -> int:
         refuse(str(error))
     outcome = None
     try:
-        from mjx_reinforce.runs.perform import perform
-
         outcome = perform(design, interrupt)
         report_on(outcome)
     except ImportError as error:
@@ -263,7 +260,7 @@ def refuse(message: str, status: int = 2) -> NoReturn:
     sys.exit(status)
 
 
-def report_on(outcome: "Outcome", *, report: bool = True) -> None:
+def report_on(outcome: Outcome, *, report: bool = True) -> None:
     """Says what a run or a sweep found, whose report is written, if that is asked for."""
     display, directory, summary = outcome.display, outcome.directory, outcome.summary
     assert directory is not None

@@ -16,9 +16,9 @@ from mjx_reinforce.runs.plan import Part, Prepared
 from mjx_reinforce.runs.saving import Files
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.store.ready import Ready
-from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.driver import Driver, Observer, Runs, Training, check_layout
 from mjx_reinforce.training.record import HOPELESS, Record, RunRecord
+from mjx_reinforce.training.resume import Checkpoint
 from mjx_reinforce.training.slots import Compiled, Slots, compile_slots, started
 from mjx_reinforce.training.state import Budget, begin_with, budget_of, last_actors
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from mjx_reinforce.engine.base import Environment
 from mjx_reinforce.engine.memory import host_memory
-from mjx_reinforce.registry import is_own
+from mjx_reinforce.registry import find_algorithm, is_own
 from mjx_reinforce.reports.experiment import counted
 from mjx_reinforce.runs.design import Design
 from mjx_reinforce.settings.config import MAX_COUNT, Config, is_read, marked
@@ -23,9 +23,9 @@ from mjx_reinforce.settings.groups import Reader
 from mjx_reinforce.store.provenance import provenance
 from mjx_reinforce.store.ready import Ready, get_ready
 from mjx_reinforce.training import resume
-from mjx_reinforce.training.checkpoint import Checkpoint
-from mjx_reinforce.training.division import Division, divide_run
+from mjx_reinforce.training.division import Division
 from mjx_reinforce.training.driver import Runs
+from mjx_reinforce.training.resume import Checkpoint
 from mjx_reinforce.training.slots import Stopwatch
 from mjx_reinforce.training.state import StateRows, last_actors
 
@@ -120,6 +120,29 @@ def prepare(
     group, width = Group(config, np.zeros(1, int), {}), division.lanes(config.num_seeds)
     part = Part(group, ready, config.num_seeds, width, split_runs(group, "000", 1))
     return Prepared(design, [part], division, known, found, clock)
+
+
+#: Episodes are divided among GPUs only where each plays so many of an update, of all seeds: fewer
+#: take as long as these. Devices of a CPU are there because the user made them.
+_LEAST = 1024
+
+
+def divide_run(config: Config) -> Division:
+    """Returns how a run is divided among the devices of this process.
+
+    Args:
+      config: its settings.
+    """
+    here, num_seeds = jax.local_device_count(), config.num_seeds
+    width = -(-num_seeds // here)
+    by_seeds = Division(seeds=-(-num_seeds // width))
+    if find_algorithm(config.algorithm).search_episodes or is_own(config.algorithm):
+        return by_seeds
+    episodes = max(n for n in range(1, here + 1) if config.num_episodes % n == 0)
+    each = num_seeds * config.episodes_per_update / episodes
+    enough = each >= _LEAST or jax.default_backend() == "cpu"
+    # How many seeds' episodes a device plays, by either.
+    return Division(episodes=episodes) if enough and num_seeds / episodes < width else by_seeds
 
 
 def _find(config: Config, say: Callable[[str], None]) -> Checkpoint | None:

@@ -35,10 +35,10 @@ from mjx_reinforce.runs.plan import Part, Prepared
 from mjx_reinforce.runs.sinks import Sink, open_sinks
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store.provenance import provenance
-from mjx_reinforce.training import checkpoint, resume
-from mjx_reinforce.training.checkpoint import Checkpoint
+from mjx_reinforce.training import resume
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer, Seen, Training
 from mjx_reinforce.training.record import HEADER, Cells, lines
+from mjx_reinforce.training.resume import Checkpoint
 
 #: Between checkpoints (s), where the user has not said how many updates.
 _CHECKPOINT_SECONDS = 60.0
@@ -186,7 +186,7 @@ class RunFiles(Files[Driver]):
         resumed = [*self.contents.get("resumed", []), moment]
         self._write_json("config.json", self.contents | budgets | {"resumed": resumed})
         self._write_json("summary.json", {"status": "running", **moment})
-        checkpoint.remove_checkpoints(self._checkpoints, after=found.number if found else 0)
+        resume.remove_checkpoints(self._checkpoints, after=found.number if found else 0)
         if found is None:
             write_bytes(self._metrics, HEADER)
         else:
@@ -228,7 +228,7 @@ class RunFiles(Files[Driver]):
         """Writes a checkpoint, which says how long metrics.csv is with all rows in it."""
         self._write_rows()
         content = driver.checkpoint()._replace(metrics_bytes=self._metrics.stat().st_size)
-        checkpoint.save(self._checkpoints, content, even=content.is_even(driver.config.eval_every))
+        resume.save(self._checkpoints, content, even=content.is_even(driver.config.eval_every))
 
     def _save_policies(self, driver: Driver) -> None:
         """Writes the last and the best policies."""
@@ -298,7 +298,7 @@ class SweepFiles(Files[Training]):
 
     def began(self, driver: Training) -> None:
         """Takes a chunk to its newest checkpoint, if there is one."""
-        found = checkpoint.read_checkpoints(self._folder(driver), self._say)
+        found = resume.read_checkpoints(self._folder(driver), self._say)
         self._go_on(driver, next(found, None))
 
     def ended(self, driver: Training) -> None:
@@ -307,7 +307,7 @@ class SweepFiles(Files[Training]):
             super().ended(driver)
             return
         self._write_part(driver)
-        checkpoint.remove_checkpoints(self._folder(driver))
+        resume.remove_checkpoints(self._folder(driver))
 
     def finished(self, driver: Training, summary: dict[str, Any]) -> None:
         """Joins the parts so far, sorted; those of a sweep that ended go after sweep.json."""
@@ -324,7 +324,7 @@ class SweepFiles(Files[Training]):
             shutil.rmtree(self._parts)
 
     def _save_checkpoint(self, driver: Training) -> None:
-        checkpoint.save(self._folder(driver), driver.checkpoint(), even=False)
+        resume.save(self._folder(driver), driver.checkpoint(), even=False)
 
     def _folder(self, driver: Training) -> Path:
         """Returns the folder of a chunk's checkpoints."""

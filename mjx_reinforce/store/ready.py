@@ -1,18 +1,37 @@
-"""A run made ready: what its settings come to, and its programs before they are compiled."""
+"""A run made ready: what its settings come to, and its programs before they are compiled.
+
+Programs are kept on disk, as JAX exports them: a run that was compiled before is not traced. They
+lie beside XLA's compiled programs in JAX's cache, under a hash of all that they depend on: every
+source file of this package, the versions of others, the settings, the device. What a run begins
+with (its seeds) and when it ends are inputs of its programs. What they take and return is described
+in JSON, without pickle: pytrees whose leaves are shapes or random keys.
+"""
 
 import dataclasses
 import functools
+import hashlib
+import importlib
+import json
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
+import jax
+import numpy as np
+
 from mjx_reinforce import envs
-from mjx_reinforce.engine.base import Environment
+from mjx_reinforce.engine.base import Environment, PyTree, is_key
+from mjx_reinforce.engine.cache import Cache
+from mjx_reinforce.envs.settings import split_words
 from mjx_reinforce.learning.learner import Learner
-from mjx_reinforce.settings.config import Config, check_read_by_policy
-from mjx_reinforce.store import kept
+from mjx_reinforce.registry import is_own
+from mjx_reinforce.settings.config import CODE, Config, check_read_by_policy, marked
+from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.store.build import build, policy_settings
-from mjx_reinforce.training.division import Division, divide_run
+from mjx_reinforce.store.provenance import provenance, version
+from mjx_reinforce.training.division import ALONE, Division
 from mjx_reinforce.training.programs import Programs, programs_of
+from mjx_reinforce.training.resume import recordable
+from mjx_reinforce.training.state import Budget, StateRows
 
 
 class Ready(NamedTuple):
@@ -38,7 +57,7 @@ def get_ready(
     config: Config,
     default: Config,
     env: Environment | None = None,
-    division: Division | None = None,
+    division: Division = ALONE,
     traced: Collection[str] | None = None,
 ) -> Ready:
     """Returns what the settings come to; those of a run from disk, if they did before.
@@ -53,17 +72,13 @@ def get_ready(
     Raises:
       ValueError: the settings do not fit the environment.
     """
-    division = division or divide_run(config)
-    key = kept.key_of(config) if traced is None else None
+    key = key_of(config) if traced is None else None
     ready = None if key is None else _found(key, config, division)
     if ready is None:
         built = envs.make_set(config.env, config.env_set) if env is None else env
         ready = made(built, config, division, traced)
         if key is not None:
-            facts = ready._asdict()
-            del facts["programs"]
-            whole = kept.keep(key, facts, ready.programs())
-            ready = ready._replace(programs=lambda: whole)
+            ready = keep(key, ready)
     if config.resume is None and config.policy == "auto":
         check_read_by_policy(config, default, ready.policy["policy"])
     return ready
@@ -71,24 +86,20 @@ def get_ready(
 
 def _found(key: str, config: Config, division: Division) -> Ready | None:
     """Returns what is on disk of the settings; None if nothing is."""
-    found = kept.read_programs(key)
+    found = read_ready(key, division)
     if found is None and config.resume is not None:
         # A run that is resumed has its time limit from config.json, also one that was not given.
-        first = kept.key_of(dataclasses.replace(config, horizon=None))
-        found = None if first is None else kept.read_programs(first)
-        if found is not None and found[0]["horizon"] != config.horizon:
+        first = key_of(dataclasses.replace(config, horizon=None))
+        found = None if first is None else read_ready(first, division)
+        if found is not None and found.horizon != config.horizon:
             return None
-    if found is None:
-        return None
-    facts, programs = found
-    programs = programs._replace(division=division)
-    return Ready(**facts, programs=lambda: programs)
+    return found
 
 
 def made(
     env: Environment,
     config: Config,
-    division: Division | None = None,
+    division: Division = ALONE,
     traced: Collection[str] | None = None,
 ) -> Ready:
     """Returns what the settings come to in an environment.
@@ -96,14 +107,13 @@ def made(
     Args:
       env: what is trained on.
       config: the settings.
-      division: among which devices they are divided; by default as ``divide_run`` says.
+      division: among which devices they are divided.
       traced: of a sweep, the names of the settings that differ from run to run of its programs.
         None of a run, whose programs measure more.
 
     Raises:
       ValueError: the settings do not fit the environment.
     """
-    division = division or divide_run(config)
     devices = division.devices() if division.episodes > 1 else None
     learner, horizon = build(env, config, devices=devices)
     threshold = getattr(env, "reward_threshold", None)
@@ -134,3 +144,150 @@ def made(
         why=learner.engine.why,
         programs=programs,
     )
+
+
+_PROGRAMS = ("begin", "advance", "evaluate")
+
+
+def key_of(config: Config) -> str | None:
+    """Returns a name for all that the programs of a run depend on.
+
+    None where nothing is kept: where ``Cache.find`` finds no place, and of code or a model of the
+    user's.
+    """
+    cache = Cache.find()
+    own = not envs.is_ours(config.env) or any(is_own(getattr(config, name)) for name in CODE)
+    if cache is None or own:
+        return None
+    if "xml_file" in split_words(config.env_set):  # the file may change
+        return None
+    made_by = provenance()
+    del made_by["git_commit"]  # the sources say it better
+    # Of the budgets, ``block_length`` says what changes a program.
+    inputs = marked(Mark.NOT_COMPILED)
+    settings = {k: v for k, v in recordable(config).items() if k not in inputs}
+    known = {
+        "settings": settings | {"block": config.block_length},
+        "engine": cache.made_by("mjx_reinforce"),
+        "made_by": made_by,
+        "numpy": version("numpy"),
+    }
+    return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
+
+
+def keep(key: str, ready: Ready) -> Ready:
+    """Returns what is made ready, with programs that are written to disk when they are traced.
+
+    A program that JAX cannot export, such as one that calls Python, is not kept.
+
+    Args:
+      key: of ``key_of``.
+      ready: all of it but the programs is in JSON's types.
+    """
+    programs, facts, cache = ready.programs(), ready._asdict(), Cache.find()
+    like = programs.like
+    del facts["programs"]
+    assert cache is not None  # there is a key
+    try:
+        whole = {"facts": facts, "like": describe_tree(like), "rides": programs.rides}
+    except TypeError:
+        return ready
+    cache.write(f"{key}-facts", json.dumps(whole).encode())
+    width = len(like.eval_keys)
+    seed, numbers, count = (jax.ShapeDtypeStruct(x, np.uint32) for x in ((), (width,), (2,)))
+    rows = jax.ShapeDtypeStruct((width, StateRows(like).size), np.uint8)
+    which, look = (jax.ShapeDtypeStruct(x, bool) for x in ((width,), ()))
+    given = {
+        "begin": (seed, numbers, {}),  # a run has no settings that are traced
+        "advance": (rows, (count,) * len(Budget._fields), which, look),
+        "evaluate": (rows, which),
+    }
+    kept = programs._replace(
+        **{
+            name: cache.keep(f"{key}-{name}", getattr(programs, name), given[name])
+            for name in _PROGRAMS
+        }
+    )
+    return ready._replace(programs=lambda: kept)
+
+
+def read_ready(key: str, division: Division = ALONE) -> Ready | None:
+    """Returns what was kept under a name; None unless all of it is on disk."""
+    cache = Cache.find()
+    facts = None if cache is None else cache.read(f"{key}-facts")
+    if cache is None or facts is None:
+        return None
+    loaded: list[Any] = [cache.load(f"{key}-{name}") for name in _PROGRAMS]
+    if any(program is None for program in loaded):
+        return None
+    whole = json.loads(facts)
+    like = rebuild(whole["like"])
+    programs = Programs(*loaded, rides=whole["rides"], like=like, division=division)
+    return Ready(**whole["facts"], programs=lambda: programs)
+
+
+#: The packages whose classes a description may name.
+_PACKAGES = ("mjx_reinforce", "optax")
+
+
+def describe_tree(tree: PyTree) -> Any:
+    """Returns what JSON can hold of a pytree: its structure, and its leaves' shapes and dtypes.
+
+    Args:
+      tree: of dicts, tuples, lists, None, NamedTuples and dataclasses; every leaf has a shape.
+
+    Raises:
+      TypeError: it has something else.
+    """
+    if tree is None:
+        return None
+    if isinstance(tree, dict):
+        return {"dict": {name: describe_tree(x) for name, x in tree.items()}}
+    kind, fields = type(tree), _fields(tree)
+    if fields is not None:
+        if kind.__module__.partition(".")[0] not in _PACKAGES:
+            raise TypeError(f"{kind} is of another package than {', '.join(_PACKAGES)}")
+        if "." in kind.__qualname__:
+            raise TypeError(f"{kind} is not at the top of its module")
+        parts = {name: describe_tree(getattr(tree, name)) for name in fields}
+        return {"class": f"{kind.__module__}:{kind.__qualname__}", "fields": parts}
+    if isinstance(tree, tuple | list):
+        return {kind.__name__: [describe_tree(x) for x in tree]}
+    if not hasattr(tree, "shape"):
+        raise TypeError(f"a leaf of {kind}")
+    return {"leaf": "key" if is_key(tree) else np.dtype(tree.dtype).name, "shape": list(tree.shape)}
+
+
+def rebuild(described: Any) -> Any:
+    """Returns the pytree of ``describe_tree``; its leaves are ``jax.ShapeDtypeStruct``.
+
+    Raises:
+      ValueError, KeyError, TypeError, AttributeError or ImportError: it is no such description.
+    """
+    if described is None:
+        return None
+    if "leaf" in described:
+        kind = described["leaf"]
+        dtype = _key_dtype() if kind == "key" else np.dtype(kind)
+        return jax.ShapeDtypeStruct(tuple(described["shape"]), dtype)
+    if "class" in described:
+        module, _, name = described["class"].partition(":")
+        if module.partition(".")[0] not in _PACKAGES:
+            raise ValueError(f"{module} is of another package than {', '.join(_PACKAGES)}")
+        parts = {name: rebuild(x) for name, x in described["fields"].items()}
+        return getattr(importlib.import_module(module), name)(**parts)
+    if "dict" in described:
+        return {name: rebuild(x) for name, x in described["dict"].items()}
+    ((kind, parts),) = described.items()
+    return {"tuple": tuple, "list": list}[kind](map(rebuild, parts))
+
+
+def _fields(tree: PyTree) -> tuple[str, ...] | None:
+    """Returns the names of the fields of a dataclass or NamedTuple; None of anything else."""
+    if dataclasses.is_dataclass(tree):
+        return tuple(field.name for field in dataclasses.fields(tree))
+    return getattr(tree, "_fields", None)
+
+
+def _key_dtype() -> Any:
+    return jax.eval_shape(jax.random.key, 0).dtype

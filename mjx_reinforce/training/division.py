@@ -16,13 +16,6 @@ from jax.sharding import PartitionSpec
 
 from mjx_reinforce.engine.base import PyTree
 from mjx_reinforce.engine.devices import NONE, RUNS, Devices
-from mjx_reinforce.engine.play.episode import largest_divisor
-from mjx_reinforce.registry import find_algorithm, is_own
-from mjx_reinforce.settings.config import Config
-
-#: Episodes are divided among GPUs only where each plays so many of an update, of all seeds: fewer
-#: take as long as these. Devices of a CPU are there because the user made them.
-_LEAST = 1024
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,21 +94,3 @@ _devices = functools.cache(Devices)
 
 #: One device trains.
 ALONE = Division()
-
-
-def divide_run(config: Config) -> Division:
-    """Returns how a run is divided among the devices of this process.
-
-    Args:
-      config: its settings.
-    """
-    here, num_seeds = jax.local_device_count(), config.num_seeds
-    width = -(-num_seeds // here)
-    by_seeds = Division(seeds=-(-num_seeds // width))
-    if find_algorithm(config.algorithm).search_episodes or is_own(config.algorithm):
-        return by_seeds
-    episodes = largest_divisor(config.num_episodes, here)
-    each = num_seeds * config.episodes_per_update / episodes
-    enough = each >= _LEAST or jax.default_backend() == "cpu"
-    # How many seeds' episodes a device plays, by either.
-    return Division(episodes=episodes) if enough and num_seeds / episodes < width else by_seeds

@@ -11,9 +11,8 @@ from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import MAX_COUNT, Config
-from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.record import Cells, Record, RunRecord
-from mjx_reinforce.training.resume import decisive
+from mjx_reinforce.training.resume import Checkpoint, decisive
 from mjx_reinforce.training.slots import Measured, Slots
 from mjx_reinforce.training.state import Best, StateRows, first_best, keep_best
 

@@ -22,7 +22,7 @@ from mjx_reinforce.envs.outcomes import check_outcome, check_start
 from mjx_reinforce.envs.settings import EpisodeSettings, read_settings
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import HORIZONS
-from mjx_reinforce.store import kept
+from mjx_reinforce.store import ready
 
 IDS = envs.names()
 #: Arguments of Gymnasium's tasks that are about pictures.
@@ -303,8 +303,8 @@ def test_the_table_s_own_settings_hold_beside_those():
 
 def test_programs_of_a_model_of_the_user_s_are_not_kept(monkeypatch, tmp_path):
     monkeypatch.setattr(objects, "folder", lambda: tmp_path)
-    assert kept.key_of(Config(env_set=("xml_file=./mine.xml",))) is None
-    keys = [kept.key_of(Config(env_set=words)) for words in ((), ("frame_skip=2",))]
+    assert ready.key_of(Config(env_set=("xml_file=./mine.xml",))) is None
+    keys = [ready.key_of(Config(env_set=words)) for words in ((), ("frame_skip=2",))]
     assert None not in keys
     assert len(set(keys)) == 2
 

@@ -11,7 +11,7 @@ from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.results import Callbacks
 from mjx_reinforce.runs.saving import RunFiles
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training.checkpoint import Checkpoint
+from mjx_reinforce.training.resume import Checkpoint
 
 
 class Run:
@@ -57,7 +57,7 @@ def watched(tmp_path, monkeypatch):
         (saving, "write_json", lambda path, _: path.name),
         (saving, "save_policy", lambda folder, actor, settings: f"{actor} policies"),
         (saving.files, "append", lambda path, _: path.name),
-        (saving.checkpoint, "save", lambda _, x, even: f"checkpoint of {x.seconds}"),
+        (saving.resume, "save", lambda _, x, even: f"checkpoint of {x.seconds}"),
     ):
         monkeypatch.setattr(owner, name, lambda *x, what=what, **more: write(what(*x, **more)))
     monkeypatch.setattr(saving.curves, "picture", lambda *given: b"png")

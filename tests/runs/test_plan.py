@@ -17,7 +17,6 @@ from mjx_reinforce.runs.design import Design, check_design
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import HORIZONS, MINUTES, PRESETS, of_task
 from mjx_reinforce.training import slots
-from mjx_reinforce.training.division import divide_run
 
 
 @pytest.fixture
@@ -116,7 +115,7 @@ def test_a_plan_says_how_many_devices_compute(monkeypatch, seeds, episodes, said
     monkeypatch.setattr(jax, "local_device_count", lambda: 4)
     monkeypatch.setattr(jax, "local_devices", lambda: devices)
     config = Config(num_seeds=seeds, num_episodes=episodes)
-    division = divide_run(config)
+    division = plan.divide_run(config)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert plan._where(division) == said
 

@@ -31,7 +31,7 @@ from mjx_reinforce.runs.saving import SweepFiles, join_parts
 from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.store import ready
 from mjx_reinforce.store.build import build
-from mjx_reinforce.training import checkpoint, driver, slots
+from mjx_reinforce.training import driver, resume, slots
 from mjx_reinforce.training.division import ALONE
 from mjx_reinforce.training.programs import programs_of
 from mjx_reinforce.training.state import StateRows
@@ -267,7 +267,7 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
     """
     monkeypatch.setattr(plan, "_CPU_EPISODES", 16)
     drive, driven, ended, tried = driver.Training.drive, [], [], []
-    add, save, write = SweepFiles._write_part, SweepFiles._save_checkpoint, checkpoint.save
+    add, save, write = SweepFiles._write_part, SweepFiles._save_checkpoint, resume.save
 
     def interrupted(*arguments):
         driven.append(None)
@@ -306,7 +306,7 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
     assert json.loads(Path("parts/sweep.json").read_text())["status"] == "running"
     assert len(list(Path("parts/parts").glob("[0-9]*.npz"))) == 2
     capsys.readouterr()
-    monkeypatch.setattr(checkpoint, "save", full)
+    monkeypatch.setattr(resume, "save", full)
     assert run("--resume parts") == 0
     assert len(tried) > 4
     said = capsys.readouterr().out

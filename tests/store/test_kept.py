@@ -24,7 +24,7 @@ from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.gpu import seam as gpu
 from mjx_reinforce.engine.play import objects
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.store import kept, ready
+from mjx_reinforce.store import ready
 from mjx_reinforce.training.slots import compile_run
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=4000, eval_episodes=2)
@@ -95,33 +95,33 @@ def test_a_second_start_traces_nothing_and_gives_the_same(monkeypatch):
 
 
 def test_seeds_and_budgets_are_inputs_and_all_else_is_not():
-    key = kept.key_of(CONFIG)
+    key = ready.key_of(CONFIG)
     for change in ({"seed": 7}, {"env_steps": 999}, {"log": ("wandb",)}):
-        assert kept.key_of(dataclasses.replace(CONFIG, **change)) == key
+        assert ready.key_of(dataclasses.replace(CONFIG, **change)) == key
     changes = ({"num_seeds": 3}, {"discount": 0.5}, {"horizon": 9}, {"eval_every": 2})
-    others = [kept.key_of(dataclasses.replace(CONFIG, **change)) for change in changes]
+    others = [ready.key_of(dataclasses.replace(CONFIG, **change)) for change in changes]
     assert len({key, *others}) == 1 + len(changes)
 
 
 def test_programs_depend_on_sources_versions_the_machine_and_its_devices(monkeypatch):
-    key, another = kept.key_of(CONFIG), {"git_commit": "", "python": "another"}
+    key, another = ready.key_of(CONFIG), {"git_commit": "", "python": "another"}
     for owner, name, value in (
-        *((objects, "source_digest", another), (kept, "provenance", another)),
-        *((cache, "made_for", another), (kept, "version", another), (jax, "device_count", 8)),
+        *((objects, "source_digest", another), (ready, "provenance", another)),
+        *((cache, "made_for", another), (ready, "version", another), (jax, "device_count", 8)),
     ):
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, lambda *_, value=value: value)
-            assert kept.key_of(CONFIG) != key, name
+            assert ready.key_of(CONFIG) != key, name
 
 
 def test_programs_depend_on_what_jax_is_told(monkeypatch):
-    keys = {kept.key_of(CONFIG)}
+    keys = {ready.key_of(CONFIG)}
     with jax.default_matmul_precision("float32"):
-        keys.add(kept.key_of(CONFIG))
+        keys.add(ready.key_of(CONFIG))
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
-    keys.add(kept.key_of(CONFIG))
+    keys.add(ready.key_of(CONFIG))
     monkeypatch.setattr(cache, "platform", lambda: "tpu")
-    keys.add(kept.key_of(CONFIG))
+    keys.add(ready.key_of(CONFIG))
     assert len(keys) == 4
     assert None in keys
 
@@ -142,15 +142,15 @@ def test_a_program_that_launches_a_gpus_kernel_is_kept(monkeypatch):
 
 def test_a_program_whose_kernel_is_gone_is_not_read():
     name = gpu._target("0" * 64).encode()
-    for each in ("facts", *kept._PROGRAMS):
+    for each in ("facts", *ready._PROGRAMS):
         cache.Cache.find().write(f"key-{each}", name if each == "advance" else b"{}")
-    assert kept.read_programs("key") is None
+    assert ready.read_ready("key") is None
 
 
 def test_a_commit_that_changes_no_source_changes_nothing(monkeypatch):
-    made_by, key = kept.provenance(), kept.key_of(CONFIG)
-    monkeypatch.setattr(kept, "provenance", lambda: made_by | {"git_commit": "0123"})
-    assert kept.key_of(CONFIG) == key
+    made_by, key = ready.provenance(), ready.key_of(CONFIG)
+    monkeypatch.setattr(ready, "provenance", lambda: made_by | {"git_commit": "0123"})
+    assert ready.key_of(CONFIG) == key
 
 
 @pytest.mark.slow
@@ -174,14 +174,14 @@ def test_what_is_damaged_is_made_again(expected, folder, monkeypatch):
         monkeypatch.setattr(machine, "_LOADED", {})
         for path, content in whole.items():
             path.write_bytes(content)
-        assert kept.read_programs(kept.key_of(CONFIG)) is not None
+        assert ready.read_ready(ready.key_of(CONFIG)) is not None
         monkeypatch.setattr(machine, "_LOADED", {})
         (path,) = (path for path in whole if path.stem.partition("-")[2] == name)
         path.write_bytes(whole[path][:-1])
-        assert kept.read_programs(kept.key_of(CONFIG)) is None, name
+        assert ready.read_ready(ready.key_of(CONFIG)) is None, name
     again = numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
     jax.tree.map(np.testing.assert_array_equal, again, expected)
-    assert kept.read_programs(kept.key_of(CONFIG)) is not None
+    assert ready.read_ready(ready.key_of(CONFIG)) is not None
 
 
 @pytest.mark.slow
@@ -198,17 +198,17 @@ def test_programs_need_no_code_of_others(folder, monkeypatch):
     monkeypatch.setattr(seam, "targets", lambda: [*own(), "mjx_reinforce_" + 64 * "0"])
     prepared = ready.get_ready(CONFIG, CONFIG)
     compile_run(prepared.programs(), CONFIG)
-    assert kept.read_programs(kept.key_of(CONFIG)) is not None
+    assert ready.read_ready(ready.key_of(CONFIG)) is not None
 
 
 def test_nothing_is_kept_of_code_of_the_users_or_where_kernels_are_looked_at(monkeypatch):
-    assert kept.key_of(CONFIG) is not None
+    assert ready.key_of(CONFIG) is not None
     for name in ("Survive-v0", "toys:Survive"):
-        assert kept.key_of(Config(env=name)) is None
+        assert ready.key_of(Config(env=name)) is None
     for looks in ("jax_debug_nans", "jax_debug_infs"):
         jax.config.update(looks, True)
         try:
-            assert kept.key_of(CONFIG) is None
+            assert ready.key_of(CONFIG) is None
         finally:
             jax.config.update(looks, False)
     for owner, name, value in (
@@ -217,7 +217,7 @@ def test_nothing_is_kept_of_code_of_the_users_or_where_kernels_are_looked_at(mon
     ):
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, value)
-            assert kept.key_of(CONFIG) is None
+            assert ready.key_of(CONFIG) is None
 
 
 @contextlib.contextmanager
@@ -275,15 +275,15 @@ def test_a_program_that_calls_python_is_not_kept(folder):
 
 def test_a_tree_of_other_classes_is_neither_described_nor_rebuilt():
     with pytest.raises(TypeError, match="another package"):
-        kept.describe_tree({"a": Survive().reset(jax.random.key(0))})
+        ready.describe_tree({"a": Survive().reset(jax.random.key(0))})
     with pytest.raises(TypeError, match="a leaf of"):
-        kept.describe_tree([3])
-    assert kept.rebuild(kept.describe_tree((optax.EmptyState(), None))) == (
+        ready.describe_tree([3])
+    assert ready.rebuild(ready.describe_tree((optax.EmptyState(), None))) == (
         optax.EmptyState(),
         None,
     )
     with pytest.raises(ValueError, match="another package"):
-        kept.rebuild({"class": "subprocess:Popen", "fields": {"args": {"dict": {}}}})
+        ready.rebuild({"class": "subprocess:Popen", "fields": {"args": {"dict": {}}}})
 
 
 _SECOND = """

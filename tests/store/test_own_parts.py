@@ -12,7 +12,7 @@ from mjx_reinforce import load, sweep
 from mjx_reinforce.engine.play import objects
 from mjx_reinforce.envs import make
 from mjx_reinforce.settings.config import Config, check
-from mjx_reinforce.store import kept
+from mjx_reinforce.store import ready
 from mjx_reinforce.store.build import build
 
 SOURCE = """
@@ -112,9 +112,9 @@ def test_what_is_no_name_is_refused_before_anything_is_imported():
 
 def test_programs_of_the_user_s_code_are_not_kept(monkeypatch, tmp_path):
     monkeypatch.setattr(objects, "folder", lambda: tmp_path)
-    assert kept.key_of(Config()) is not None
+    assert ready.key_of(Config()) is not None
     for name in ("estimator", "policy", "algorithm"):
-        assert kept.key_of(Config(**{name: "mine:weights"})) is None
+        assert ready.key_of(Config(**{name: "mine:weights"})) is None
 
 
 def flags(**settings):

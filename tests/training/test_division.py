@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from places import PYTHONPATH, ROOT
 
+from mjx_reinforce.runs import plan
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training import resume
-from mjx_reinforce.training.division import ALONE, Division, divide_run
+from mjx_reinforce.training.division import ALONE, Division
 
 #: What is compared, the settings, and how that is divided.
 VARIANTS = {
@@ -65,7 +66,7 @@ def test_what_is_divided(monkeypatch, seeds, episodes, here, backend, expected):
     monkeypatch.setattr(jax, "local_device_count", lambda: here)
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     config = Config(num_seeds=seeds, num_episodes=episodes)
-    division = divide_run(config)
+    division = plan.divide_run(config)
     assert division == expected
     assert division.lanes(seeds) >= seeds
     assert episodes % division.episodes == 0

@@ -20,9 +20,9 @@ from mjx_reinforce import files
 from mjx_reinforce import files as export_files
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.runs import plan
-from mjx_reinforce.runs.directory import locked
+from mjx_reinforce.runs.perform import locked
 from mjx_reinforce.runs.saving import RunFiles
-from mjx_reinforce.training import checkpoint
+from mjx_reinforce.training import resume
 from mjx_reinforce.training.slots import Slots
 
 #: One of our tasks, whose programs are kept on disk: only the first run traces and compiles them.
@@ -108,13 +108,13 @@ def test_a_checkpoint_that_is_cut_or_compressed_is_none(trained, tmp_path):
     [*_, newest] = checkpoints(trained)
     content, packed = newest.read_bytes(), io.BytesIO()
     np.savez_compressed(packed, **np.load(newest))
-    name = f"{newest.name.split('-')[0]}-{checkpoint._digest(packed.getvalue())}.npz"
+    name = f"{newest.name.split('-')[0]}-{resume._digest(packed.getvalue())}.npz"
     (tmp_path / name).write_bytes(packed.getvalue())
-    assert checkpoint._read(tmp_path / name) is None
-    assert checkpoint._read(newest) == content
+    assert resume._read(tmp_path / name) is None
+    assert resume._read(newest) == content
     for damaged in (content[:-7], b"", content[:-1] + b"!"):
         (tmp_path / newest.name).write_bytes(damaged)
-        assert checkpoint._read(tmp_path / newest.name) is None
+        assert resume._read(tmp_path / newest.name) is None
 
 
 @pytest.mark.slow
@@ -136,7 +136,7 @@ def test_a_full_disk_costs_no_training(run, trained, tmp_path, monkeypatch, caps
         real_append(path, content)
 
     monkeypatch.setattr(files, "append", full_for_rows)
-    for module in (checkpoint, export_files):
+    for module in (resume, export_files):
         monkeypatch.setattr(module, "write_bytes", full)
     arguments = ["--max-updates", 20, "--checkpoint-every", 5, "--output", "full"]
     assert run(*COMMON, *arguments) == 0
@@ -290,7 +290,7 @@ def test_the_folder_of_a_run_that_begins_elsewhere_stays(run, tmp_path, monkeypa
             other.enter_context(locked(directory))
             return locked(directory)
 
-        monkeypatch.setattr("mjx_reinforce.runs.directory.locked", quicker)
+        monkeypatch.setattr("mjx_reinforce.runs.perform.locked", quicker)
         assert run("--output", "out/in") == 2
     assert "another process trains in out/in" in capsys.readouterr().err
     assert (tmp_path / "out" / "in").is_dir()
