@@ -8,7 +8,7 @@ from mjx_reinforce.envs import make_vec
 from mjx_reinforce.export.player import Player, load
 from mjx_reinforce.export.policy_files import load_policy, save_policy
 from mjx_reinforce.export.run_files import pretrained
-from mjx_reinforce.learning.bounded import clipped_normal, tanh_normal, truncated_normal
+from mjx_reinforce.learning.bounded import tanh_normal, truncated_normal
 from mjx_reinforce.learning.distributions import Distribution, categorical, normal
 from mjx_reinforce.learning.estimators import (
     Estimator,
@@ -87,7 +87,6 @@ __all__ = [
     "act",
     "ars",
     "categorical",
-    "clipped_normal",
     "compare_all",
     "deterministic",
     "discount_weights",

@@ -15,7 +15,6 @@ DISTRIBUTIONS = {
     "normal-softplus": "mjx_reinforce.learning.distributions:normal_softplus",
     "normal-sigmoid": "mjx_reinforce.learning.distributions:normal_sigmoid",
     "truncated-normal": "mjx_reinforce.learning.bounded:truncated_normal",
-    "clipped-normal": "mjx_reinforce.learning.bounded:clipped_normal",
     "tanh-normal": "mjx_reinforce.learning.bounded:tanh_normal",
     "deterministic": "mjx_reinforce.published.variants:deterministic",
     "categorical": "mjx_reinforce.learning.distributions:categorical",

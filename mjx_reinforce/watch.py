@@ -1,7 +1,6 @@
 """``python -m mjx_reinforce.watch RUN`` plays a trained policy and makes a video of it."""
 
 import dataclasses
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -11,9 +10,10 @@ from rich.progress import track
 
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
-from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.console.streams import heartbeat, silence_alarms
-from mjx_reinforce.export.films import Take, gif, import_mujoco, side_by_side, with_sky
+from mjx_reinforce.console.jax_setup import configure_jax, warn
+from mjx_reinforce.console.streams import silence_alarms
+from mjx_reinforce.engine.checks import explain
+from mjx_reinforce.export.films import Take, check_drawing, gif, side_by_side, with_sky
 from mjx_reinforce.export.run_files import Run, SeedChoice, Which, choose_seed, read_run
 from mjx_reinforce.files import check_output, write_bytes
 from mjx_reinforce.settings.config import check_named
@@ -80,7 +80,7 @@ def film(settings: WatchSettings) -> None:
         raise ValueError(f"--env is {settings.env}, but {run.directory} was trained on {run.env}")
     check_named({"env": run.env}, {"env": settings.env}, run.directory)
     output = film_path(settings, run)
-    import_mujoco()
+    check_drawing()
     configure_jax()
     from mjx_reinforce.export.player import load_seed
 
@@ -93,7 +93,7 @@ def film(settings: WatchSettings) -> None:
     model, takes = scene(env), []
     for label, player in players.items():
         name, play = simulator(env, player, run.horizon)
-        with _waiting("compiling and playing"):
+        with Console(stderr=True).status("compiling and playing"):
             episode = play(settings.episode, settings.noise)
         steps = f"{len(episode.rewards)} steps in {name}"
         print(f"{label}: return {episode.total:.1f} in {steps}")
@@ -164,20 +164,15 @@ def untrained(player: "Player") -> "Player":
 def simulator(env: "Environment", player: "Player", horizon: int) -> tuple[str, Any]:
     """Returns the name of a simulation and a ``playing.Simulator``: C MuJoCo's, if that can play.
 
-    It starts at once, where ours is compiled first.
+    It starts at once. Ours is compiled first, which takes up to a minute, so that it says why.
     """
     from mjx_reinforce import playing
 
     try:
         return "mujoco", playing.mujoco_simulator(env, player, horizon)
-    except Exception:  # of what a task of the user's own asks
+    except Exception as error:  # of what a task of the user's own asks
+        warn(f"C MuJoCo cannot play this task ({explain(error)}), so MJX is compiled for it")
         return "mjx", playing.simulator(env, player, horizon)
-
-
-def _waiting(what: str) -> AbstractContextManager[Any]:
-    """Returns a ``with`` block that shows on the screen that its contents are still running."""
-    console = Console(stderr=True)
-    return console.status(what) if console.is_terminal else heartbeat(console.print, what)
 
 
 def scene(env: Any) -> Any:

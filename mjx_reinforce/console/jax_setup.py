@@ -61,7 +61,7 @@ def _choose_cache() -> None:
         chosen = os.path.join(cache, "mjx_reinforce")
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if chosen and "://" not in chosen and (why := _unusable(Path(chosen))):
-        _warn(
+        warn(
             f"the cache {chosen} is not used ({why}), so the next start compiles again; set "
             f"{variable} to a folder of your own"
         )
@@ -82,6 +82,6 @@ def _unusable(folder: Path) -> str | None:
 
 
 @functools.cache
-def _warn(text: str) -> None:
+def warn(text: str) -> None:
     """Says something once."""
     print(f"warning: {text}", file=sys.stderr)

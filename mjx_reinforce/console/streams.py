@@ -1,12 +1,8 @@
 """Standard output and error of a command: what is written to them, and how wide."""
 
-import contextlib
 import io
 import os
 import sys
-import threading
-import time
-from collections.abc import Callable, Iterator
 from typing import Any, TextIO
 
 
@@ -66,33 +62,3 @@ def say(text: str, stream: TextIO) -> None:
 def say_error(message: str) -> None:
     """Prints what is wrong to standard error, in one line."""
     say(f"error: {' '.join(message.split())}", sys.stderr)
-
-
-#: Seconds between two signs.
-_INTERVAL = 15.0
-
-
-@contextlib.contextmanager
-def heartbeat(
-    say: Callable[[str], None], what: str = "compiling", interval: float = _INTERVAL
-) -> Iterator[None]:
-    """Says again and again, while its block runs, that it goes on.
-
-    Args:
-      say: shows a line.
-      what: is done in it.
-      interval: time between two lines (s).
-    """
-    ended, began = threading.Event(), time.perf_counter()
-
-    def beat() -> None:
-        while not ended.wait(interval):
-            say(f"still {what}, {time.perf_counter() - began:.0f} s")
-
-    thread = threading.Thread(target=beat, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()

@@ -20,7 +20,6 @@ HEADS: dict[str, Literal["mean", "clip", "tanh", "argmax"]] = {
     "normal-sigmoid": "mean",
     "deterministic": "mean",
     "truncated-normal": "clip",
-    "clipped-normal": "clip",
     "tanh-normal": "tanh",
     "categorical": "argmax",
 }
@@ -53,7 +52,7 @@ def numpy_policy(
     layers = [params[f"Dense_{i}"] for i in range(len(params))]
     layers = [(np.asarray(x["kernel"]), np.asarray(x["bias"])) for x in layers]
     middle, half, arrays = _ending(HEADS[family], saved.settings)
-    # Further columns of a shared trunk are standard deviations, which the mode does not need.
+    # Further columns are standard deviations, which the mode does not need.
     weight, bias = (x[..., : len(half)].astype(np.float64) for x in layers[-1])
     layers[-1] = weight * half, bias * half + middle
     lines = []

@@ -27,11 +27,7 @@ class Renderer:
     """
 
     def __init__(self, model: "MjModel", width: int, height: int):
-        """Opens MuJoCo's renderer for pictures of so many pixels.
-
-        Raises:
-          ValueError: there is no OpenGL here.
-        """
+        """Opens MuJoCo's renderer for pictures of so many pixels; see ``check_drawing``."""
         mujoco = import_mujoco()
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
         model.vis.global_.offheight = max(model.vis.global_.offheight, height)
@@ -42,11 +38,7 @@ class Renderer:
         model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, max(width, height))
         self._camera, self._followed = _camera(model)
         self._model, self._data = model, mujoco.MjData(model)
-        try:
-            with warnings.catch_warnings(action="ignore"):  # GLFW's, before it fails
-                self._renderer = mujoco.Renderer(model, height, width)
-        except Exception as error:  # each of MuJoCo's backends has its own
-            raise _no_drawing(error) from error
+        self._renderer = mujoco.Renderer(model, height, width)
         # Without this it closes itself when Python ends, too late for its own modules.
         weakref.finalize(self, self._renderer.close)
 
@@ -100,20 +92,23 @@ def import_mujoco() -> Any:
     """Returns MuJoCo; without a screen it is told to draw through EGL, where that is installed."""
     if not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL"):
         os.environ.setdefault("MUJOCO_GL", "egl")
-    try:
-        import mujoco
-    except Exception as error:  # what MUJOCO_GL names is not here
-        raise _no_drawing(error) from error
+    import mujoco
+
     return mujoco
 
 
-def _no_drawing(error: Exception) -> ValueError:
-    """Returns what is said where MuJoCo's own error would be, and what to do."""
-    how = f"with MUJOCO_GL={chosen}" if (chosen := os.environ.get("MUJOCO_GL")) else "here"
-    return ValueError(
-        f"MuJoCo cannot draw {how} ({error}); set MUJOCO_GL=egl, and install EGL if it is not here "
-        "(Debian: apt install libegl1)"
-    )
+def check_drawing() -> None:
+    """Raises ValueError, with what to do, where MuJoCo cannot draw; it takes a moment."""
+    try:
+        with warnings.catch_warnings(action="ignore"):  # GLFW's, before it fails
+            mujoco = import_mujoco()
+            mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
+    except Exception as error:  # each of MuJoCo's backends has its own
+        how = f"with MUJOCO_GL={chosen}" if (chosen := os.environ.get("MUJOCO_GL")) else "here"
+        raise ValueError(
+            f"MuJoCo cannot draw {how} ({error}); set MUJOCO_GL=egl, or MUJOCO_GL=osmesa without a "
+            "GPU, and install what is missing (Debian: apt install libegl1 libosmesa6)"
+        ) from error
 
 
 #: Frames a second at most: what a film shows, and what GIF viewers play.
@@ -173,7 +168,7 @@ def side_by_side(
       max_rate: frames a second at most.
 
     Raises:
-      ValueError: there is no take, or no OpenGL.
+      ValueError: there is no take.
     """
     if not takes:
         raise ValueError("a video needs at least one take")

@@ -55,7 +55,7 @@ def save_policy(directory: Path, actor: Actor, settings: dict[str, Any]) -> None
       actor: every leaf with a leading seed axis [S, ...].
       settings: ``policy`` (a name), ``hidden_sizes``, ``initial_std``, ``observation_size``,
         ``action_low`` and ``action_high`` or, if discrete, ``num_actions``; optionally
-        ``shared_trunk``, ``initializer``, ``rescale``: what ``build_policy`` reads.
+        ``initializer`` and ``rescale``: what ``build_policy`` reads.
 
     Examples:
       >>> import pathlib, tempfile
@@ -190,9 +190,11 @@ def _checksum(settings: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:
 def build_policy(settings: dict[str, Any]) -> Policy:
     """Returns the policy that ``settings`` of ``save_policy`` describe.
 
-    What an older file does not say is as it was then: one trunk, orthogonal
-    weights, means scaled to the action's range.
+    What an older file does not say is as it was then: orthogonal weights, and means scaled to the
+    action's range.
     """
+    if not settings.get("shared_trunk", True):
+        raise ValueError("a second network for standard deviations is of an earlier version")
     family = settings["policy"]
     make = load_choice("policy", family, DISTRIBUTIONS)
     arguments = {k: settings.get(k, default) for k, default in _FAMILY_ARGUMENTS.items()}
@@ -207,7 +209,6 @@ def build_policy(settings: dict[str, Any]) -> Policy:
         settings["observation_size"],
         distribution,
         settings["hidden_sizes"],
-        shared_trunk=settings.get("shared_trunk", True),
         initializer=settings.get("initializer", "orthogonal"),
     )
 

@@ -1,4 +1,4 @@
-"""Gaussian families that keep actions in a finite range: clipped, through a tanh, or truncated.
+"""Gaussian families that keep actions in a finite range: through a tanh, or truncated.
 
 They need integrals of the Normal density over an interval, accurate even far out in its tails: a
 truncated Normal needs ratios of them. Far from the mean both terms of a ratio are 0 in
@@ -46,55 +46,6 @@ _PIVOT = 4.0
 # A bound farther away, in standard deviations, is treated as this far: it cuts off nothing either
 # way, and the square stays finite in float32.
 _FAR = 1e9
-
-
-def clipped_normal(
-    space: Box | Discrete, *, std: str = "parameter", initial_std: float = 0.5, rescale: bool = True
-) -> Distribution:
-    """``normal``, clipped to the action's range, which must be finite.
-
-    The environment sees only the clipped action, so ``log_prob`` is the log of that
-    action's probability: the Normal's density inside the range, and at a bound the
-    probability of everything that is clipped to it. The gradient has the same mean as
-    that of ``normal`` and less variance (Fujita and Maeda 2018, arXiv:1802.07564,
-    equation 8). ``entropy`` is that of the clipped action, -E[log_prob].
-
-    Examples:
-      >>> import numpy as np
-      >>> import mjx_reinforce as mr
-      >>> mr.clipped_normal(mr.Box(-np.ones(2), np.ones(2)))
-      Distribution(2 outputs, 2 constants)
-    """
-    layout = _bounded_outputs("clipped-normal", space, std, initial_std, rescale)
-
-    def log_density(action, mean, std):
-        low, high = _bounds(layout, mean)
-        inside = normal_log_density(action, mean, std)
-        below, above = log_tail((mean - low) / std), log_tail((high - mean) / std)
-        return jnp.where(action <= low, below, jnp.where(action >= high, above, inside))
-
-    return layout.family(
-        sample=lambda noise, mean, std: jnp.clip(mean + std * noise, *_bounds(layout, mean)),
-        mode=lambda mean: jnp.clip(mean, *_bounds(layout, mean)),
-        log_density=log_density,
-        entropy=lambda mean, std: _clipped_entropy(mean, std, *_bounds(layout, mean)),
-    )
-
-
-def _clipped_entropy(mean: jax.Array, std: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
-    """Returns the entropy [...] of a clipped Normal in nats, entry by entry.
-
-    Inside the range -log_prob is x^2 / 2 + log(std sqrt(2 pi)) with x = (action - mean) / std.
-    With a and b the bounds in this unit, phi the standard Normal's density and P the probability
-    of [a, b], the integral of x^2 phi(x) from a to b is P + a phi(a) - b phi(b). Each bound adds
-    -p log p, with p the probability of what is clipped to it.
-    """
-    a, b = (low - mean) / std, (high - mean) / std
-    log_below, log_above = log_tail(-a), log_tail(b)
-    below, above = jnp.exp(log_below), jnp.exp(log_above)
-    edges = b * jnp.exp(-0.5 * b**2 - LOG_SQRT_2PI) - a * jnp.exp(-0.5 * a**2 - LOG_SQRT_2PI)
-    inside = (1.0 - below - above) * normal_entropy(std) - 0.5 * edges
-    return inside - below * log_below - above * log_above
 
 
 def tanh_normal(

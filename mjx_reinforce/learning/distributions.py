@@ -41,8 +41,6 @@ class Distribution(NamedTuple):
       mode: (outputs [..., K]) -> action like ``sample``, the deterministic policy
       log_prob: (outputs [..., K], action [..., A]) -> [...], summed over entries
       entropy: (outputs [..., K]) -> [...], in nats
-      num_scales: how many of ``num_outputs``, counted from the last, determine the width
-        of the distribution; a second network may compute them
       std: (outputs [..., K]) -> [..., A] the standard deviation in the action's unit, before what
         the family does to keep actions in their range; None where there is none
       kl: (outputs, other outputs) -> [...] the divergence KL(first || second) in nats, if known
@@ -65,7 +63,6 @@ class Distribution(NamedTuple):
     mode: Callable[[jax.Array], jax.Array]
     log_prob: Callable[[jax.Array, jax.Array], jax.Array]
     entropy: Callable[[jax.Array], jax.Array]
-    num_scales: int = 0
     std: Callable[[jax.Array], jax.Array] | None = None
     kl: Callable[[jax.Array, jax.Array], jax.Array] | None = None
     fisher: Callable[[jax.Array], jax.Array] | None = None
@@ -261,7 +258,6 @@ class GaussianOutputs(NamedTuple):
                 log_density(action, *self.split(outputs)), axis=-1
             ),
             entropy=lambda outputs: jnp.sum(entropy(*self.split(outputs)), axis=-1),
-            num_scales=0 if constant else self.size,
             std=lambda outputs: self.split(outputs)[1],
         )
 

@@ -101,7 +101,6 @@ def mlp_policy(
     distribution: Distribution,
     hidden_sizes: Sequence[int] = (32, 32),
     *,
-    shared_trunk: bool = True,
     initializer: str = "orthogonal",
 ) -> Policy:
     """Builds a policy whose distribution has its parameters from an MLP with tanh units.
@@ -110,17 +109,13 @@ def mlp_policy(
       observation_size: O.
       distribution: the family whose parameters the network computes.
       hidden_sizes: units of each hidden layer; empty for a linear policy.
-      shared_trunk: True for one network that computes means and standard deviations;
-        False for a second network, of the same sizes, for the standard deviations.
       initializer: of the weights, see ``MLP``.
 
     Returns:
-      The policy; its params are ``{"network": ..., "constants": [K - num_outputs]}``,
-      and ``"scale_network"`` without a shared trunk.
+      The policy; its params are ``{"network": ..., "constants": [K - num_outputs]}``.
 
     Raises:
-      ValueError: a layer has no units, the initializer is unknown, or a second network
-        is asked for and no standard deviation depends on the observation.
+      ValueError: a layer has no units, or the initializer is unknown.
 
     Examples:
       >>> import jax
@@ -134,49 +129,22 @@ def mlp_policy(
     check_count("observation_size", observation_size)
     check_kind("distribution", distribution, Distribution, "mjx_reinforce.normal(env.action_space)")
     check_type("hidden_sizes", hidden_sizes, tuple[int, ...])
-    networks = _networks(distribution, tuple(hidden_sizes), shared_trunk, initializer)
-    constants = distribution.constants
-
-    def init(key):
-        keys = [key] if len(networks) == 1 else jax.random.split(key, len(networks))
-        params = {
-            name: network.init(key, jnp.zeros(observation_size))
-            for (name, network), key in zip(networks.items(), keys, strict=True)
-        }
-        return params | {"constants": jnp.asarray(constants, jnp.result_type(float))}
-
-    def apply(params, observation):
-        outputs = [
-            jnp.asarray(network.apply(params[name], observation))
-            for name, network in networks.items()
-        ]
-        batch = outputs[0].shape[:-1]
-        fixed = jnp.broadcast_to(params["constants"], (*batch, len(constants)))
-        return jnp.concatenate([*outputs, fixed], axis=-1)
-
-    return Policy(init, apply, distribution)
-
-
-def _networks(
-    distribution: Distribution, hidden_sizes: tuple[int, ...], shared_trunk: bool, initializer: str
-) -> dict[str, MLP]:
-    """Returns the networks by their name in the params; raises ValueError as ``mlp_policy``."""
     if any(size < 1 for size in hidden_sizes):
         raise ValueError(f"every hidden layer needs at least one unit, got {hidden_sizes}")
     check_name("initializer", initializer, dict.fromkeys(INITIALIZERS))
-    num_outputs, num_scales = distribution.num_outputs, distribution.num_scales
-    if not (shared_trunk or num_scales):
-        raise ValueError(
-            "without a shared trunk the standard deviation must come from the state, "
-            "as in normal-softplus; this distribution's is a constant, or it has none"
-        )
-    sizes = {"network": num_outputs}
-    if not shared_trunk:
-        sizes = {"network": num_outputs - num_scales, "scale_network": num_scales}
-    return {
-        name: MLP(hidden_sizes, size, output_scale=0.01, initializer=initializer)
-        for name, size in sizes.items()
-    }
+    network = MLP(tuple(hidden_sizes), distribution.num_outputs, 0.01, initializer)
+    constants = distribution.constants
+
+    def init(key):
+        params = network.init(key, jnp.zeros(observation_size))
+        return {"network": params, "constants": jnp.asarray(constants, jnp.result_type(float))}
+
+    def apply(params, observation):
+        outputs = jnp.asarray(network.apply(params["network"], observation))
+        fixed = jnp.broadcast_to(params["constants"], (*outputs.shape[:-1], len(constants)))
+        return jnp.concatenate([outputs, fixed], axis=-1)
+
+    return Policy(init, apply, distribution)
 
 
 class Actor(struct.PyTreeNode, kw_only=True):

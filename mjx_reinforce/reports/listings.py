@@ -55,19 +55,21 @@ def _results_table(findings: Findings) -> Listing:
 
 
 def _speed_table(findings: Findings) -> Listing:
-    """Returns the table of who learns faster: the fastest first."""
-    compared = findings.results[:COMPARED]
-    if not findings.speeds:
-        return {}
-    order, rows = by_speed(compared), []
+    """Returns the table of who learns faster: the fastest first, or who earned most on the way."""
+    compared, header = findings.results[:COMPARED], ["", "configuration", "return while training"]
+    order = np.argsort([-each.area.value for each in compared], kind="stable").tolist()
+    if findings.speeds:
+        header += ["mean steps to solve", "log-rank p, Holm"]
+        order = by_speed(compared)
+    rows = []
     for i in order:
         each, pair = compared[i], (min(i, order[0]), max(i, order[0]))
-        assert each.solving is not None
-        p_value = short_p(findings.speeds[pair]) if i != order[0] else "fastest"
-        cells = [_cell(each.solving.mean, steps), (p_value, ""), _cell(each.area)]
+        cells = [_cell(each.area)]
+        if findings.speeds and each.solving:
+            p_value = short_p(findings.speeds[pair]) if i != order[0] else "fastest"
+            cells += [_cell(each.solving.mean, steps), (p_value, "")]
         rows.append(_row(each, cells))
-    header = ["", "configuration", "mean steps to solve", "log-rank p, Holm"]
-    return {"header": [*header, "return while training"], "rows": rows}
+    return {"header": header, "rows": rows}
 
 
 def _against(findings: Findings) -> Listing:

@@ -222,7 +222,9 @@ def _read_run(directory: Path, config: dict[str, Any]) -> Source:
     summary: dict[str, Any] = read_json(path) if path.exists() else {"status": "running"}
     num_seeds = len(columns["seed"])
     with naming_damage(path):
-        nonfinite = np.array(summary.get("nonfinite", [0] * num_seeds), np.int64)
+        # Early versions wrote an empty list where all was finite.
+        counts = np.array(summary.get("nonfinite") or 0, np.int64)
+        nonfinite = np.broadcast_to(counts, num_seeds)
         outcome = _outcome(summary)
     where = [directory] * num_seeds
     kept = {name: value for name, value in config.items() if name in PROVENANCE}

@@ -4,7 +4,7 @@ import datetime
 import math
 import shlex
 from collections.abc import Iterable, Mapping
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import suppress
 from decimal import ROUND_DOWN, Decimal
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ from rich.table import Table
 from rich.text import Text
 
 from mjx_reinforce.console.commands import command
-from mjx_reinforce.console.streams import heartbeat
 from mjx_reinforce.statistics import enough, iqm
 from mjx_reinforce.training import record
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer
@@ -116,10 +115,6 @@ class Display(Observer[Driver]):
         )
         if summary["status"] == "stopped":
             self.say(f"stopped: {summary['reason']}", "red")
-
-    def compiling(self) -> AbstractContextManager[None]:
-        """Returns a ``with`` block that shows that its contents are still running."""
-        return nullcontext() if self.console.is_terminal else heartbeat(self.say)
 
     def start(self, compile_seconds: float) -> None:
         """Marks the end of compilation, from where the time left is counted."""

@@ -21,7 +21,6 @@ except ImportError as error:
 from mjx_reinforce import envs
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.console.streams import heartbeat
 from mjx_reinforce.runs.design import Design, check_design
 from mjx_reinforce.training.resume import read_record
 
@@ -187,16 +186,15 @@ def perform(
         from mjx_reinforce.runs.saving import RunFiles, SweepFiles
 
         display = _display(quiet=quiet)
-        with heartbeat(display.say, "writing the simulation out"):
+        interrupt.restore_screen(display.console.show_cursor)
+        with display.console.status("writing the simulation out"):
             prepared = prepare(design, known, env, display.say)
         display.say(describe(prepared))
         with display:
-            interrupt.restore_screen(display.console.show_cursor)
             kind = SweepFiles if design.over else RunFiles
             written = None if directory is None else kind(directory, prepared, display.say)
             conductor = Conductor(prepared, written, display, observers)
-            with display.compiling():
-                conductor.compile_first()
+            conductor.compile_first()
             # Not before: a kill while it compiles leaves nothing that would refuse the next.
             interrupt.defer(display.say)
             driver, summary = conductor.conduct(interrupt.heard)

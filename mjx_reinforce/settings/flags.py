@@ -1,9 +1,9 @@
 """Reading a command line, and refusing in one line."""
 
 import dataclasses
+import re
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -20,30 +20,22 @@ from mjx_reinforce.settings.defaults import PRESETS
 
 Form = TypeVar("Form")
 
-#: How whole numbers and paths are read, everywhere.
+#: How whole numbers are read, everywhere.
 _READERS = ConstructorRegistry()
 
 
 @_READERS.primitive_rule
 def _reader(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """Returns how a whole number or a path is read: 1e6 is a whole number, and "" is no path."""
-    readers = {int: ("INT", whole_number), Path: ("PATH", _read_path)}
-    if kind.type not in readers:
+    """Returns how a whole number is read, such as 1e6."""
+    if kind.type is not int:
         return None
-    metavar, reader = readers[kind.type]
     return PrimitiveConstructorSpec(
         nargs=1,
-        metavar=metavar,
-        instance_from_str=lambda words: reader(words[0]),
-        is_instance=lambda value: isinstance(value, kind.type),
+        metavar="INT",
+        instance_from_str=lambda words: whole_number(words[0]),
+        is_instance=lambda value: isinstance(value, int),
         str_from_instance=lambda value: [str(value)],
     )
-
-
-def _read_path(text: str) -> Path:
-    if not text:
-        raise ValueError("takes a path, got ''")
-    return Path(text)
 
 
 def read_command_line(
@@ -59,7 +51,12 @@ def read_command_line(
       arguments: the flags and their values.
       prog: the name of the program, for --help.
       description: of the program, for --help; the docstring of the form if not given.
+
+    Raises:
+      ValueError: a word or a value is empty, which would be read as the current folder.
     """
+    if any(not word or re.fullmatch("--.*=", word) for word in arguments):
+        raise ValueError("a value on the command line is empty: is a variable of the shell unset?")
     _give_help(form)
     options: dict[str, Any] = {"registry": _READERS, "config": (tyro.conf.OmitArgPrefixes,)}
     return tyro.cli(form, prog=prog, description=description, args=arguments, **options)

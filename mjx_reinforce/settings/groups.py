@@ -10,7 +10,7 @@ from mjx_reinforce.registry import find_algorithm, is_own
 from mjx_reinforce.settings.declare import COUNT, TOTAL, Mark, Range, Value, setting
 
 #: Families whose standard deviation is a parameter, the same in all states.
-_FREE_STD = ("normal", "truncated-normal", "clipped-normal", "tanh-normal")
+_FREE_STD = ("normal", "truncated-normal", "tanh-normal")
 
 
 class Reader(enum.Enum):
@@ -136,7 +136,7 @@ class PolicySettings:
 
     policy: str = "auto"
     """Action distribution: normal (one trained std), normal-softplus and normal-sigmoid (std from
-    the state), truncated-normal, clipped-normal, tanh-normal (on the action bounds), categorical
+    the state), truncated-normal and tanh-normal (within the action bounds), categorical
     (discrete actions), deterministic (ars only); auto is categorical where the actions are
     discrete, else normal, or deterministic for ars. Or module:name."""
     hidden_sizes: tuple[int, ...] = setting((32, 32), Range.LAYERS)

@@ -83,7 +83,6 @@ def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:
         "env": config.env,
         "policy": family if config.policy == "auto" else config.policy,
         "hidden_sizes": list(config.hidden_sizes),
-        "shared_trunk": True,
         "initializer": "orthogonal",
         "initial_std": config.initial_std,
         "rescale": True,

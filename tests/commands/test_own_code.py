@@ -51,6 +51,7 @@ def said(monkeypatch, capsys):
 
     def run(command):
         monkeypatch.setattr(sys, "argv", command.split())
+        monkeypatch.setattr(watch, "check_drawing", lambda: None)
         status = 0
         try:
             MAINS[command.split()[0]]()

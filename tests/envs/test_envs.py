@@ -333,6 +333,7 @@ def test_a_run_keeps_the_settings_of_its_environment(tmp_path, monkeypatch, caps
         raise ValueError("enough")
 
     monkeypatch.setattr(watch.envs, "make_set", stop)
+    monkeypatch.setattr(watch, "check_drawing", lambda: None)
     assert run_command("run", command=watch.main) == 2
     assert made == [("CartPole-v1", words)]
     capsys.readouterr()

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from saved_runs import make_run
 
-from mjx_reinforce import envs, load, pretrained
+from mjx_reinforce import load, pretrained, watch
 from mjx_reinforce.envs import models
 from mjx_reinforce.export import films
 from mjx_reinforce.export.run_files import FOLDER
@@ -58,15 +58,17 @@ def test_there_is_one_policy_of_a_task_by_its_name():
         load("HalfCheeta-v5")
 
 
-def test_a_renderer_that_is_not_here_is_answered_with_egl(monkeypatch):
+def test_a_renderer_that_is_not_here_is_answered_before_the_policy_is_read(monkeypatch, tmp_path):
     def fail(*arguments):
         warnings.warn("GLFW is not initialized", UserWarning, stacklevel=1)
         raise RuntimeError("an OpenGL platform library has not been loaded")
 
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
     monkeypatch.setattr(mujoco, "Renderer", fail)
+    monkeypatch.setattr(watch, "configure_jax", lambda: pytest.fail("it went on"))
+    settings = watch.WatchSettings(make_run(tmp_path))
     with pytest.raises(ValueError, match=r"=osmesa \(an OpenGL.* set MUJOCO_GL=egl,"):
-        films.Renderer(envs.make("Hopper-v5").mj_model, 8, 8)
+        watch.film(settings)
 
 
 class Undrawn:

@@ -191,6 +191,7 @@ def test_damage_is_named_in_one_line(tmp_path, monkeypatch, capsys, name):
     """By ``load`` and both command lines, before anything is compiled."""
     damage, file, message = DAMAGE[name]
     damage(make_run(tmp_path))
+    monkeypatch.setattr(watch, "check_drawing", lambda: None)
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
         load(tmp_path)
     said = str(caught.value)

@@ -42,7 +42,7 @@ CONTINUOUS = [name for name in supporting(SPACE) if name != "deterministic"]
 BOUNDED = sorted(set(CONTINUOUS) - set(supporting(UNBOUNDED)))
 #: Actions of positive probability; and the interval where there is a density, if it is not all of
 #: the action's range.
-ATOMS = {"clipped-normal": [LOW, HIGH], "tanh-normal": -1.0 + 2.0 * np.tanh([-6.0, 6.0])}
+ATOMS = {"tanh-normal": -1.0 + 2.0 * np.tanh([-6.0, 6.0])}
 SUPPORT = {"tanh-normal": tuple(-1.0 + 2.0 * np.tanh([-5.0, 5.0]))}
 
 
@@ -156,7 +156,7 @@ def test_the_fused_engine_writes_out_sample_and_mode(name):
 
 @pytest.mark.parametrize(
     "name",
-    ["clipped-normal", "tanh-normal", pytest.param("truncated-normal", marks=pytest.mark.slow)],
+    ["tanh-normal", pytest.param("truncated-normal", marks=pytest.mark.slow)],
 )
 def test_far_out_samples_stay_inside_and_gradients_finite(name):
     """At means up to 10,000 standard deviations beyond either bound."""

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from mjx_reinforce import Box, mlp_policy, normal
-from mjx_reinforce.engine.base import Discrete
 from mjx_reinforce.export import policy_files as checkpoint
-from mjx_reinforce.learning.distributions import categorical, normal_softplus
-from mjx_reinforce.learning.policy import MLP
+from mjx_reinforce.learning.distributions import normal_softplus
 
 SPACE = Box(np.array([-1.0, -2.0]), np.array([1.0, 2.0]))
 
@@ -38,35 +36,18 @@ def test_initial_weights_and_biases(hidden_sizes, initializer):
 
 
 @pytest.mark.parametrize("hidden_sizes", [(), (5, 3, 4)])
-@pytest.mark.parametrize("shared_trunk", [True, False])
-def test_a_fresh_policy_does_nearly_the_same_in_all_states(hidden_sizes, shared_trunk):
+def test_a_fresh_policy_does_nearly_the_same_in_all_states(hidden_sizes):
     """Its last layer is 0.01 times an orthogonal matrix, so it shrinks its input 100-fold."""
-    policy = mlp_policy(6, normal_softplus(SPACE), hidden_sizes, shared_trunk=shared_trunk)
+    policy = mlp_policy(6, normal_softplus(SPACE), hidden_sizes)
     params = policy.init(jax.random.key(0))
-    for name in ("network",) if shared_trunk else ("network", "scale_network"):
-        last = params[name]["params"][f"Dense_{len(hidden_sizes)}"]["kernel"]
-        gains = np.linalg.svd(np.asarray(last), compute_uv=False)
-        np.testing.assert_allclose(gains, 0.01, rtol=1e-5)
+    last = params["network"]["params"][f"Dense_{len(hidden_sizes)}"]["kernel"]
+    gains = np.linalg.svd(np.asarray(last), compute_uv=False)
+    np.testing.assert_allclose(gains, 0.01, rtol=1e-5)
     # The input's entries are between -1 and 1: a tanh unit's value, or here the observation's.
     outputs = policy.apply(params, jax.random.uniform(jax.random.key(1), (100, 6), float, -1, 1))
     length = np.sqrt((hidden_sizes or (6,))[-1])
     assert np.all(np.abs(outputs) <= 0.01 * length)
     assert np.all(np.std(outputs, axis=0) > 0)
-
-
-@pytest.mark.slow
-def test_separate_trunks_do_not_touch_each_other():
-    distribution = normal_softplus(SPACE)
-    policy = mlp_policy(3, distribution, (8,), shared_trunk=False)
-    params = policy.init(jax.random.key(0))
-    obs = jax.random.normal(jax.random.key(1), (5, 3))
-    slopes = jax.grad(lambda p: jnp.sum(distribution.entropy(policy.apply(p, obs))))(params)
-    assert np.all(jax.flatten_util.ravel_pytree(slopes["network"])[0] == 0)
-    assert np.any(jax.flatten_util.ravel_pytree(slopes["scale_network"])[0] != 0)
-    expected = [MLP((8,), 2).apply(params[name], obs) for name in ("network", "scale_network")]
-    np.testing.assert_allclose(
-        policy.apply(params, obs), np.concatenate(expected, axis=-1), rtol=1e-6
-    )
 
 
 def test_policies_are_rebuilt_from_settings():
@@ -83,13 +64,11 @@ def test_policies_are_rebuilt_from_settings():
     jax.tree.map(np.testing.assert_array_equal, params, expected)
     settings = old | {
         "policy": "normal-sigmoid",
-        "shared_trunk": False,
         "initializer": "torch",
         "rescale": False,
     }
     policy = checkpoint.build_policy(settings)
     params = policy.init(jax.random.key(0))
-    assert set(params) == {"network", "scale_network", "constants"}
     outputs = policy.apply(params, jnp.ones(3))
     np.testing.assert_array_equal(policy.distribution.mode(outputs), outputs[:2])
     discrete = {k: v for k, v in old.items() if "action" not in k}
@@ -102,6 +81,5 @@ def test_nonsense_is_refused():
         mlp_policy(3, normal(SPACE), initializer="xavier")
     with pytest.raises(ValueError, match="at least one unit"):
         mlp_policy(1, normal(SPACE), (32, 0))
-    for distribution in (normal(SPACE), categorical(Discrete(3))):
-        with pytest.raises(ValueError, match="must come from the state"):
-            mlp_policy(3, distribution, shared_trunk=False)
+    with pytest.raises(ValueError, match="is of an earlier version"):
+        checkpoint.build_policy({"shared_trunk": False})

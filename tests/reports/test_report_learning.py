@@ -46,8 +46,8 @@ def test_seeds_that_all_solve_are_told_apart_by_their_speed(tmp_path):
     assert said[0] == "Fastest is learning rate 0.003; the final returns are a tie."
     rows = listings.listings(found)["speed"]["rows"]
     assert [row["label"][-5:] for row in rows] == ["0.003", "0.001", " 0.01"]
-    assert rows[0]["cells"][1][0] == "fastest"
-    assert rows[1]["cells"][1][0] == "< 0.001"
+    assert rows[0]["cells"][2][0] == "fastest"
+    assert rows[1]["cells"][2][0] == "< 0.001"
 
 
 def test_equal_speeds_are_not_told_apart(tmp_path):
@@ -71,7 +71,10 @@ def test_nobody_solves_it_is_no_race(tmp_path):
     change_curves(directory, lambda x: np.minimum(x["eval_return"], 500, out=x["eval_return"]))
     found = findings_of(directory)
     assert not re.search("faster|Fastest", " ".join(words.headline(found)))
-    assert "speed" not in listings.listings(found)
+    table = listings.listings(found)["speed"]
+    assert table["header"][2:] == ["return while training"]
+    areas = sorted((each.area.value for each in found.results), reverse=True)
+    assert [float(row["cells"][0][0]) for row in table["rows"]] == pytest.approx(areas, abs=0.05)
 
 
 @pytest.mark.slow

@@ -33,11 +33,14 @@ def check_size(program: jaxprs.Program, entries: int = 0) -> None:
       program: what is written out.
       entries: of an observation.
     """
-    size = num_scalars(program) + _PER_PAIR * entries**2
-    if size > MAX_SCALARS:
+    step, pairs = num_scalars(program), _PER_PAIR * entries**2
+    if step + pairs > MAX_SCALARS:
+        remedy = f"let it observe fewer than {entries:,} numbers"
+        if step > pairs:
+            remedy = "let fewer geoms collide, such as the feet alone"
         raise TooLarge(
-            f"written out it is about {size:.2g} scalar operations, more than {MAX_SCALARS:.2g}; "
-            "let fewer geoms collide, such as the feet alone, or let it observe less"
+            f"written out it is about {step + pairs:.2g} scalar operations, more than "
+            f"{MAX_SCALARS:.2g}; {remedy}"
         )
 
 

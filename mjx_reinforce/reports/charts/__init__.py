@@ -226,28 +226,6 @@ def _by_place(labels: Sequence[str], looks: Sequence[Any], *, legend: bool = Tru
     }
 
 
-def share_layers(
-    findings: Findings,
-    data: str,
-    x: Spec,
-    title: str,
-    said: Mapping[str, tuple[str, str]],
-    interpolate: str = "linear",
-) -> Spec:
-    """Returns the band and the line of a share of the seeds over ``x``; ``said`` of a point."""
-    tips = tooltip(**said, low=("95 % from", ".1%"), high=("to", ".1%"))
-    band = {"y": quantity("low", title=title), "y2": {"field": "high"}}
-    share = quantity("share", title=title, scale={"domain": [0, 1]}, axis={"format": ".0%"})
-    line = {"y": share, "strokeDash": dashes(findings.labels), "tooltip": tips}
-    return shown_rows(data) | {
-        "encoding": {"x": x, "color": series(findings.labels)},
-        "layer": [
-            layer("area", band, opacity=0.18, interpolate=interpolate),
-            layer("line", line, strokeWidth=2.2, interpolate=interpolate),
-        ],
-    }
-
-
 def moment_line(findings: Findings) -> Spec:
     """Returns a line at the slider's env step, without one at the end of the axis."""
     end = float(findings.grid[-1])

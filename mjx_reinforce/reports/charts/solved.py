@@ -16,12 +16,9 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
     """Yields the chart; none where no seed solved the task."""
     if not any(each.solving and each.solving.ever for each in findings.results):
         return
-    said = {"env_steps": ("env steps", ",.0f"), "share": ("have solved", ".1%")}
-    title = "seeds that have solved the task"
-    lines = charts.share_layers(findings, "solved", charts.STEPS, title, said, "step-after")
     yield charts.make_chart(
         findings,
-        [lines, charts.moment_line(findings)],
+        [_bands_and_lines(findings), charts.moment_line(findings)],
         320,
         name="solved",
         title="How many have solved it",
@@ -35,6 +32,26 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         data={"solved": _shares(findings)},
         listed="solved",
     )
+
+
+def _bands_and_lines(findings: Findings) -> charts.Spec:
+    title = "seeds that have solved the task"
+    tips = charts.tooltip(
+        env_steps=("env steps", ",.0f"),
+        share=("have solved", ".1%"),
+        low=("95 % from", ".1%"),
+        high=("to", ".1%"),
+    )
+    band = {"y": charts.quantity("low", title=title), "y2": {"field": "high"}}
+    share = charts.quantity("share", title=title, scale={"domain": [0, 1]}, axis={"format": ".0%"})
+    line = {"y": share, "strokeDash": charts.dashes(findings.labels), "tooltip": tips}
+    return charts.shown_rows("solved") | {
+        "encoding": {"x": charts.STEPS, "color": charts.series(findings.labels)},
+        "layer": [
+            charts.layer("area", band, opacity=0.18, interpolate="step-after"),
+            charts.layer("line", line, strokeWidth=2.2, interpolate="step-after"),
+        ],
+    }
 
 
 def _shares(findings: Findings) -> Table:

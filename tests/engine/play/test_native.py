@@ -243,7 +243,10 @@ def test_large_models_are_not_for_machine_code(monkeypatch):
 
 
 def test_long_observations_are_not_for_machine_code():
-    with pytest.raises(scalar.TooLarge, match="observe less"):
+    with pytest.raises(
+        scalar.TooLarge,
+        match="let it observe fewer than 1,800 numbers",
+    ):
         size.check_size(scalarized.trace(jnp.sin, 1.0)[0], 1_800)
 
 
