@@ -16,23 +16,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.engine import base, scalar
+from mjx_reinforce.engine import base
 from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory
 from mjx_reinforce.engine.checks import check_count, check_key, check_name, check_parts
 from mjx_reinforce.engine.contract import check_policy
 from mjx_reinforce.engine.play import available, native, program, rollouts
-from mjx_reinforce.engine.scalar import scalarized, size
-from mjx_reinforce.engine.scalar.vmap import MAX_OPERATIONS, evaluate
 from mjx_reinforce.engine.team import program as team
 
 #: This JAX multiplies wrongly on CPUs, in some functions that are mapped over some 16,000 rows and
 #: more, and says nothing (JAX's issue 39103). Where we looked, with 33,000 to 65,000 rows, no
 #: step, policy or gradient of ours was wrong.
 _WRONG_JAX = "0.10.2"
-#: Scalar operations of a step, before any fold away: between those of the tasks without contacts
-#: and those of the others. On an H100, XLA's kernels of InvertedPendulum played 1.6 times as many
-#: env steps a second as ours, and those of HalfCheetah were still compiling after a minute.
-_SMALL = 100_000
 
 #: What an engine plays with: a rollout, or a function of many environments.
 Made = TypeVar("Made")
@@ -151,7 +145,7 @@ def _from_any_key(*given: Any, **options: Any) -> Trajectory:
 class MapEngine(NamedTuple):
     """A way to map a function.
 
-    name: "vmap" or "native"; "fused" where XLA has the function written out in scalars
+    name: "vmap" or "native"
     why: the reason it was chosen, for people
     call: the function of a batch, whose first axis of every array is N
     """
@@ -178,31 +172,8 @@ def map_function(
     Raises:
       ValueError: the name is unknown, or the engine does not support the function.
     """
-    by_xla = name == "auto" and available.platform() == "gpu" and team.why_not(env) is not None
-    made = _in_scalars(function, *examples) if by_xla else None
     in_machine_code = functools.partial(machine_code, env, function, *examples)
-    return MapEngine(*(made or pick(name, in_machine_code, jax.vmap(function))))
-
-
-def _in_scalars(
-    function: Callable[..., Any], *examples: PyTree
-) -> tuple[str, str, Callable[..., Any]] | None:
-    """Returns a function that is small enough for XLA's kernels on a GPU, written out for them."""
-    if size.num_scalars(scalarized.trace(function, *examples)[0]) >= _SMALL:
-        return None
-    try:
-        # On a GPU a real branch makes the host wait for its predicate: both sides are computed.
-        written = scalar.scalarize(function, *examples, branch_cost=MAX_OPERATIONS)
-    except Exception:  # whatever it is, another engine may play this
-        return None
-    if sum(written.operations.values()) > MAX_OPERATIONS:
-        return None
-
-    def mapped(*args: PyTree) -> Any:
-        leaves = jax.tree.leaves(args)
-        return evaluate(written, leaves, [True] * len(leaves))
-
-    return "fused", "on a GPU XLA's kernels are the fastest for so small a step", mapped
+    return MapEngine(*pick(name, in_machine_code, jax.vmap(function)))
 
 
 def machine_code(

@@ -18,7 +18,7 @@ from mjx_reinforce.engine import scalar
 from mjx_reinforce.engine.gpu import kernel as kernels
 from mjx_reinforce.engine.gpu import ptx, seam
 from mjx_reinforce.engine.physics import touching
-from mjx_reinforce.engine.play import available, choice, native, program, rollouts
+from mjx_reinforce.engine.play import available, native, program, rollouts
 from mjx_reinforce.engine.scalar import scalarized
 
 if reason := available.unavailable():
@@ -265,10 +265,6 @@ def test_mapped_over_it_remains_one_launch(monkeypatch):
     assert text.count("pure_callback[") == 1
 
 
-def test_machine_code_for_a_gpu_is_chosen_where_a_step_is_large(monkeypatch):
+def test_machine_code_for_a_gpu_is_chosen(monkeypatch):
     gpu_on_cpu.emulate(monkeypatch)
-    engine = make_vec(TOY, 4).engine
-    assert engine.name == "fused"
-    assert "XLA's kernels are the fastest" in engine.why
-    monkeypatch.setattr(choice, "_SMALL", 10)
     assert make_vec(TOY, 4).engine.name == "native"
