@@ -344,7 +344,6 @@ def train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics
       diagnostics, NaN if an episode was not finite or the update was skipped:
       ``entropy``, ``kl``, ``policy_std`` (see ``diagnostics.policy_metrics``),
       ``gradient_norm``, ``gradient_snr`` (of ``full_batch`` and ``natural_gradient`` alone),
-      ``clipped_gradients`` (see ``updates``),
       ``explained_variance`` (of an estimator with a baseline), and the estimator's own.
 
     Examples:

@@ -58,9 +58,8 @@ class Problem(NamedTuple):
 _NOISE_SHARE, _NOISE_EPISODES = 32, 64
 
 #: (problem, key, params, opt_state) -> (params, opt_state, metrics); may consume the key. The
-#: metrics are ``entropy``, the mean over samples; ``gradient_norm`` and, where ``make_optimizer``
-#: made the optimizer and it clips, ``clipped_gradients`` (1 or 0), means over optimizer steps; and
-#: what an update adds.
+#: metrics are ``entropy``, the mean over samples; ``gradient_norm``, the mean over optimizer steps;
+#: and what an update adds.
 Update = Callable[[Problem, jax.Array, Any, Any], tuple[Any, Any, dict[str, Any]]]
 #: (problem, key, params, gradient) -> what the optimizer is given for it; may consume the key.
 Turn = Callable[[Problem, jax.Array, Any, Any], Any]
@@ -134,35 +133,7 @@ def descend(
     optimizer = optax.with_extra_args_support(problem.optimizer)
     changes, opt_state = optimizer.update(turn(grads), opt_state, params, clock=problem.clock)
     metrics = {"gradient_norm": optax.tree.norm(grads)}
-    if clips := [x for x in jax.tree.leaves(opt_state, is_leaf=_is_clip) if _is_clip(x)]:
-        metrics["clipped_gradients"] = clips[-1].clipped.astype(float)
     return optax.apply_updates(params, changes), opt_state, metrics
-
-
-class ClipState(NamedTuple):
-    """State of ``clip_by_norm``: whether the last gradient was longer than its bound, bool []."""
-
-    clipped: jax.Array
-
-
-def _is_clip(state: Any) -> bool:
-    return isinstance(state, ClipState)
-
-
-def clip_by_norm(max_norm: float | jax.Array) -> optax.GradientTransformation:
-    """``optax.clip_by_global_norm``, which also remembers whether it clipped."""
-    clip = optax.clip_by_global_norm(max_norm)
-
-    def init(params):
-        del params
-        return ClipState(jnp.zeros((), bool))
-
-    def update(updates, state, params=None):
-        del state, params
-        clipped = ClipState(optax.tree.norm(updates) > max_norm)
-        return clip.update(updates, optax.EmptyState())[0], clipped
-
-    return optax.GradientTransformation(init, update)
 
 
 def make_optimizer(
@@ -202,7 +173,7 @@ def make_optimizer(
     if max_grad_norm is None:
         return optimizers[name]
     check_number("max_grad_norm", max_grad_norm, positive=True, finite=False)
-    return optax.chain(clip_by_norm(max_grad_norm), optimizers[name])
+    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optimizers[name])
 
 
 def signal_to_noise(mean: Params, each: Params, num_episodes: int) -> jax.Array:

@@ -251,7 +251,6 @@ class LogSettings:
 
     Some columns are empty in some runs. gradient_snr, the signal-to-noise ratio of the gradient,
     needs at least two episodes (or directions of ars). explained_variance needs a baseline.
-    clipped_gradients needs --max-grad-norm.
     """
 
     log: tuple[Literal["tensorboard", "wandb"], ...] = setting(

@@ -25,7 +25,7 @@ COLUMNS = (
     *("seed", "update", "episodes", "env_steps", "wall_seconds"),
     *("train_return", "eval_return", "eval_return_stochastic", "eval_length", "train_length"),
     *("entropy", "gradient_norm", "nonfinite_episodes", "skipped_update"),
-    *("kl", "policy_std", "explained_variance", "gradient_snr", "clipped_gradients"),
+    *("kl", "policy_std", "explained_variance", "gradient_snr"),
 )
 HEADER = (",".join(COLUMNS) + "\n").encode()
 #: What these columns are called among the metrics of an update.

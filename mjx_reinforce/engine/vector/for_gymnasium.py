@@ -1,6 +1,5 @@
 """The environments as Gymnasium's ``VectorEnv``, with NumPy arrays, JAX's or torch's."""
 
-import os
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
@@ -72,8 +71,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         batch = gymnasium.vector.utils.batch_space
         self.observation_space = batch(self.single_observation_space, self.num_envs)
         self.action_space = batch(self.single_action_space, self.num_envs)
-        self._arrays, self._process = arrays, os.getpid()
-        self._out = _HAND_OUT[arrays]
+        self._arrays, self._out = arrays, _HAND_OUT[arrays]
         self._reset, self._restart = jax.jit(vec.reset), jax.jit(vec.restart)
         # What is handed out without a copy must outlive the next step.
         self._step = jax.jit(vec.step, donate_argnums=0 if arrays == "numpy" else ())
@@ -175,11 +173,6 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     def _check_open(self) -> None:
         if self.closed:
             raise gymnasium.error.ClosedEnvironmentError("it was closed; make another")
-        if os.getpid() != self._process:
-            raise RuntimeError(
-                f"it was made in process {self._process}, and this is {os.getpid()}: make it where "
-                "it is used, and start processes by spawn"
-            )
 
     def _keys(self, seed: Seeds) -> jax.Array:
         """Returns a key for each environment [N]."""

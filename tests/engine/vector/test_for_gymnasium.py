@@ -11,7 +11,6 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from mjx_reinforce import envs, gym
-from mjx_reinforce.engine.vector import for_gymnasium
 
 CART, REACHER = "mjx_reinforce/CartPole-v1", "mjx_reinforce/Reacher-v5"
 PENDULUM = "mjx_reinforce/InvertedPendulum-v5"
@@ -191,14 +190,6 @@ def test_wrong_order_and_bad_arguments(cart):
     for seed in (1.5, True, "abc"):
         with pytest.raises(ValueError, match="seed must be a whole number"):
             cart.reset(seed=seed)
-
-
-def test_in_another_process(cart, monkeypatch):
-    cart.reset(seed=0)
-    here = cart.unwrapped._process
-    monkeypatch.setattr(for_gymnasium.os, "getpid", lambda: here + 1)
-    with pytest.raises(RuntimeError, match="start processes by spawn"):
-        cart.step(np.zeros(3, int))
 
 
 def test_closed_twice(cart):
