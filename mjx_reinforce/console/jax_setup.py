@@ -40,10 +40,9 @@ def configure_jax() -> None:
     except RuntimeError as error:
         raise ValueError(f"JAX cannot compute here: {error}") from error
     except AssertionError as error:  # JAX knows the platform, but has no plugin for it
-        platforms = settings["jax_platforms"]
         raise ValueError(
-            f"JAX cannot compute here: JAX_PLATFORMS is {platforms!r}, for which no plugin is "
-            "installed; install JAX for it, such as by pip install 'jax[cuda12]', or unset it"
+            f"JAX cannot compute here: JAX_PLATFORMS is {settings['jax_platforms']!r}, for which "
+            "no plugin is installed; install JAX for it (pip install 'jax[cuda12]'), or unset it"
         ) from error
     # A GPU's first program takes two seconds to start, while Python imports what else is needed.
     threading.Thread(target=jax.numpy.zeros, args=((),)).start()

@@ -111,9 +111,8 @@ def compute_capability() -> str:
 
 def kernel_dependencies() -> str:
     """Returns what a program with kernels depends on."""
-    processors = jax.devices()[0].core_count
-    of_teams = nvrtc.version()
-    return f"compute capability {compute_capability()}, {processors} multiprocessors, {of_teams}"
+    counted = f"{jax.devices()[0].core_count} multiprocessors"
+    return f"compute capability {compute_capability()}, {counted}, {nvrtc.version()}"
 
 
 def launch(
