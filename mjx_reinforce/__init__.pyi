@@ -5,8 +5,7 @@ from mjx_reinforce.engine.play.choice import rollout
 from mjx_reinforce.engine.vector.environment import VectorEnv, VectorState
 from mjx_reinforce.engine.vector.segments import Segment, unroll
 from mjx_reinforce.envs import make_vec
-from mjx_reinforce.export.player import Player, load
-from mjx_reinforce.export.policy_files import load_policy, save_policy
+from mjx_reinforce.export.policy_files import Player, load, load_policy, save_policy
 from mjx_reinforce.export.run_files import pretrained
 from mjx_reinforce.learning.bounded import tanh_normal, truncated_normal
 from mjx_reinforce.learning.distributions import Distribution, categorical, normal

@@ -10,7 +10,7 @@ import numpy as np
 
 from mjx_reinforce.engine.play.episode import begin, hold, step
 from mjx_reinforce.envs.in_mujoco import InMujoco
-from mjx_reinforce.export.player import Player
+from mjx_reinforce.export.policy_files import Player
 from mjx_reinforce.learning.policy import act
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from mjx_reinforce.settings.flags import run_command
 
 if TYPE_CHECKING:
     from mjx_reinforce.engine.base import Environment
-    from mjx_reinforce.export.player import Player
+    from mjx_reinforce.export.policy_files import Player
 
 #: Where runs are put that name no other place, see ``Design.directory``.
 RUNS = Path("runs")
@@ -82,7 +82,7 @@ def film(settings: WatchSettings) -> None:
     output = film_path(settings, run)
     check_drawing()
     configure_jax()
-    from mjx_reinforce.export.player import load_seed
+    from mjx_reinforce.export.policy_files import load_seed
 
     player, _ = load_seed(run, settings.seed, settings.which, settings.policy)
     label = run.env if run.packaged else f"{run.env}, seed {player.seed}"

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import stats
 
 from experiments.studies.seeds import answers
-from mjx_reinforce.statistics import aggregates, comparisons, iqm_interval, mean_interval, survival
+from mjx_reinforce.statistics import comparisons, iqm_interval, mean_interval, survival, wilson
 
 SEEDS = (6, 20, 50, 200)
 
@@ -64,7 +64,7 @@ def rates(draws: int) -> Iterator[tuple[str, str, list[str]]]:
         cells = []
         for num_seeds in SEEDS:
             count = np.random.default_rng(num_seeds).binomial(num_seeds, rate, draws)
-            cells.append(share(*aggregates.wilson(count, num_seeds)[1:], rate))
+            cells.append(share(*wilson(count, num_seeds)[1:], rate))
         yield "rate (Wilson)", f"{100 * rate:.0f} %", cells
 
 

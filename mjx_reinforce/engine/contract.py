@@ -141,7 +141,7 @@ def _check_state(name: str, start: PyTree) -> None:
         ("done", 0, "a scalar []", "reduce it, as with jnp.any"),
     ):
         value = getattr(start, field, None)
-        got = f"there is no {field}" if value is None else f"it is {_described(value)}"
+        got = f"there is no {field}" if value is None else f"it is {described(value)}"
         said = f"{name}.reset must return a state whose {field} is {shape}, and {got}; "
         require(hasattr(value, "shape"), f"{said}brax.envs.State has all that is needed")
         array: Any = value
@@ -167,8 +167,8 @@ def _check_same(name: str, start: PyTree, after: PyTree) -> None:
         holds = old.dtype == new.dtype or jnp.promote_types(old.dtype, new.dtype) == old.dtype
         require(
             old.shape == new.shape and holds,
-            f"{name}.step must return a state like reset's: {path} is {_described(old)} after "
-            f"reset, and {_described(new)} after step",
+            f"{name}.step must return a state like reset's: {path} is {described(old)} after "
+            f"reset, and {described(new)} after step",
         )
 
 
@@ -178,7 +178,8 @@ def _paths(tree: PyTree) -> dict[str, Any]:
     return {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in leaves}
 
 
-def _described(value: jax.Array) -> str:
+def described(value: Any) -> str:
+    """Returns the dtype and shape of an array, or the type of what is none."""
     if hasattr(value, "shape"):
         return f"{value.dtype}{list(value.shape)}"
     return f"a {type(value).__name__}"

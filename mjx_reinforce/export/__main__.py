@@ -41,7 +41,7 @@ def export(settings: ExportSettings) -> list[Path]:
     """
     run = read_run(settings.run)
     from mjx_reinforce.export.arithmetic import numpy_policy
-    from mjx_reinforce.export.player import load_seed
+    from mjx_reinforce.export.policy_files import load_seed
     from mjx_reinforce.files import write_arrays, write_bytes
 
     player, saved = load_seed(run, settings.seed, settings.which)

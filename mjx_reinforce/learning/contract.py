@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from mjx_reinforce.engine.base import Environment, PyTree, Trajectory, null_action
 from mjx_reinforce.engine.checks import check_kind, check_type, explain
+from mjx_reinforce.engine.contract import described
 from mjx_reinforce.learning import updates
 from mjx_reinforce.learning.distributions import Distribution
 from mjx_reinforce.learning.estimators import Estimator
@@ -54,7 +55,7 @@ def check_policy(
         fixed = f", then distribution.constants [2, {constants}], as parameters" * bool(constants)
         raise ValueError(
             f"{given} must return [2, {count + constants}]: what a network computes [2, {count}]"
-            f"{fixed}; got {_shape_or_type(outputs)}"
+            f"{fixed}; got {described(outputs)}"
         )
     if not jnp.issubdtype(outputs.dtype, jnp.floating):
         raise ValueError(f"{given} must return floating-point numbers, got {outputs.dtype}")
@@ -65,7 +66,7 @@ def check_policy(
     action, size = traced("policy.distribution.sample", draw, outputs), null_action(env).shape
     if getattr(action, "shape", None) != (2, *size):
         raise ValueError(
-            f"policy.distribution draws actions {_shape_or_type(action)} for two observations, "
+            f"policy.distribution draws actions {described(action)} for two observations, "
             f"{type(env).__name__} takes {[2, *size]}; make it for the actions of this environment"
         )
     if likelihood:
@@ -120,10 +121,9 @@ def check_estimator(
         )
     weight, _, metrics = returned
     if getattr(weight, "shape", None) != shape or not jnp.issubdtype(weight.dtype, jnp.floating):
-        got = f"{weight.dtype}{list(weight.shape)}" if hasattr(weight, "shape") else type(weight)
         raise ValueError(
             f"estimator.update must return a weight for every action, float [T, N], here "
-            f"{list(shape)}; got {got}"
+            f"{list(shape)}; got {described(weight)}"
         )
     if not isinstance(metrics, dict):
         raise ValueError(
@@ -140,8 +140,3 @@ def traced(name: str, function: Callable[..., PyTree], *arguments: PyTree) -> An
 
 
 _shaped: Any = jax.ShapeDtypeStruct
-
-
-def _shape_or_type(value: Any) -> str:
-    """Returns the shape of an array, or the type of what is none."""
-    return str(list(value.shape)) if hasattr(value, "shape") else f"a {type(value).__name__}"

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_reinforce.reports.experiment import Configuration, Experiment
-from mjx_reinforce.statistics import Estimate, iqm, iqm_interval
-from mjx_reinforce.statistics.aggregates import cvar, estimate_mean, wilson
+from mjx_reinforce.statistics import Estimate, cvar, estimate_mean, iqm, iqm_interval, wilson
 from mjx_reinforce.statistics.comparisons import Comparison, compare_all, holm
 from mjx_reinforce.statistics.survival import (
     collapses,

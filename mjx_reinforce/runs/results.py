@@ -12,8 +12,7 @@ import numpy as np
 
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.engine.checks import check_kind
-from mjx_reinforce.export.player import Player
-from mjx_reinforce.export.policy_files import build_policy
+from mjx_reinforce.export.policy_files import Player, build_policy
 from mjx_reinforce.export.run_files import Which
 from mjx_reinforce.files import read_arrays, read_json
 from mjx_reinforce.learning.policy import Actor, Policy

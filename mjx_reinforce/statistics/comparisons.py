@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from mjx_reinforce.statistics import Estimate, alike, enough, worst_if_not_finite
-from mjx_reinforce.statistics.aggregates import wilson
+from mjx_reinforce.statistics import Estimate, alike, enough, wilson, worst_if_not_finite
 
 #: Experiments that are drawn to see how often a test of few seeds is right.
 _EXPERIMENTS = 2000

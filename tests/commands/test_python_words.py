@@ -30,10 +30,10 @@ def weigh(update):
 
 #: What is given to ``reinforce``, and what it must say; engine/play/test_contract.py has the rest.
 REFUSED = {
-    r"must return \[2, 2\]: .* then distribution.constants \[2, 1\], as parameters; got \[2, 1": {
+    r"must return \[2, 2\]: .* then distribution.constants \[2, 1\], as parameters; got float32": {
         "policy": matrix(1)
     },
-    r"must return \[2, 2\].*got \[2, 5\]": {"policy": matrix(5)},
+    r"must return \[2, 2\].*got float32\[2, 5\]": {"policy": matrix(5)},
     "type Policy, such as mjx_reinforce.mlp_policy.* got a Distribution": {"policy": NORMAL},
     "type Policy.* got mlp_policy": {"policy": m.mlp_policy},
     r"apply\(.*\[2, 1\]\) fails: Scope": {"policy": m.mlp_policy(3, NORMAL)},

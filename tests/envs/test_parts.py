@@ -14,7 +14,7 @@ from mjx_reinforce.engine.play.episode import episode_keys
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import MujocoEnv
 from mjx_reinforce.envs.in_mujoco import InMujoco
-from mjx_reinforce.export.player import Player
+from mjx_reinforce.export.policy_files import Player
 from mjx_reinforce.learning import normalize
 from mjx_reinforce.learning.policy import Actor
 

@@ -1,6 +1,7 @@
 """What a report says of the speed of learning, and what lies beside the page."""
 
 import re
+import types
 
 import numpy as np
 import pytest
@@ -9,7 +10,9 @@ from measured_runs import make_measured_run
 from pages import change_curves, findings_of, visible
 
 from mjx_reinforce import report
-from mjx_reinforce.reports import listings, words
+from mjx_reinforce.reports import findings, listings, words
+from mjx_reinforce.statistics.comparisons import holm
+from mjx_reinforce.statistics.survival import log_rank
 
 RATES = {"learning_rate": [1e-3, 3e-3, 1e-2]}
 
@@ -99,3 +102,35 @@ def test_a_run_is_told_in_plain_words(tmp_path):
     said = words.headline(findings_of(directory))
     assert said[0].startswith("3 seeds of CartPole-v1 ended with a mean return of ")
     assert " before training." in said[0]
+
+
+def result(steps=None, *, solved=None, mean=None):
+    if steps is None:
+        return types.SimpleNamespace(solving=None)
+    solved = np.full(len(steps), True) if solved is None else np.asarray(solved)
+    value = types.SimpleNamespace(value=steps.mean() if mean is None else mean)
+    solving = types.SimpleNamespace(steps=steps, solved=solved, ever=solved.sum(), mean=value)
+    return types.SimpleNamespace(solving=solving)
+
+
+QUICK, SLOW = np.arange(100, 160, 10), np.arange(400, 1000, 100)
+
+
+def test_speeds_are_log_rank_tests_of_all_pairs():
+    solved = [True, True, False, True, True, True]
+    results = [result(QUICK), result(SLOW, solved=solved), result(SLOW)]
+    speeds = findings.compare_speeds(results)
+    assert [*speeds] == [(0, 1), (0, 2), (1, 2)]
+    exact = [
+        log_rank(*(x for k in pair for x in (results[k].solving.steps, results[k].solving.solved)))
+        for pair in ((0, 1), (0, 2), (1, 2))
+    ]
+    np.testing.assert_allclose([*speeds.values()], holm([x.p_value for x in exact]))
+    assert speeds[0, 1] < 0.01 < speeds[1, 2]
+    assert findings.compare_speeds([result(), result()]) == {}
+    assert findings.compare_speeds([result(QUICK, solved=[False] * 6)] * 2) == {}
+
+
+def test_the_fastest_has_the_fewest_mean_steps():
+    results = [result(SLOW), result(SLOW, mean=1), result(QUICK)]
+    assert findings.by_speed(results) == [1, 2, 0]

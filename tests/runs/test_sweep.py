@@ -20,7 +20,7 @@ from toys import Drift
 import mjx_reinforce
 from mjx_reinforce import envs
 from mjx_reinforce import train as train_module
-from mjx_reinforce.export.player import load_seed
+from mjx_reinforce.export.policy_files import load_seed
 from mjx_reinforce.export.run_files import choose_seed, read_run
 from mjx_reinforce.report import WrittenReport
 from mjx_reinforce.runs import command_line, conduct, plan

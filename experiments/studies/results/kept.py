@@ -20,8 +20,7 @@ from experiments.studies.results.runs import ended
 from experiments.studies.results.tasks import Task
 from mjx_reinforce.files import csv_text, read_json, write_bytes, write_json
 from mjx_reinforce.reports.sources import PROVENANCE, read_columns, read_metrics
-from mjx_reinforce.statistics import steps_to_solve
-from mjx_reinforce.statistics.aggregates import estimate_mean
+from mjx_reinforce.statistics import estimate_mean, steps_to_solve
 
 #: The policies that are played, by rank in the final evaluation.
 POLICIES = ("best", "median")

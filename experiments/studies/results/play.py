@@ -93,7 +93,7 @@ def _play(
     run: Run, policy: Any, num_episodes: int, ours: Any, film: Path | None
 ) -> list[dict[str, Any]]:
     """Plays one policy, films it if so wished, and returns a row for each episode."""
-    from mjx_reinforce.export.player import load_seed
+    from mjx_reinforce.export.policy_files import load_seed
 
     player, _ = load_seed(run, policy)
     env = gymnasium.make(run.env, max_episode_steps=run.horizon)

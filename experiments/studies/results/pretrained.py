@@ -15,8 +15,7 @@ from experiments.studies.results.play import own_simulation
 from experiments.studies.results.runs import ended
 from mjx_reinforce import envs
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.export.player import Player, load_seed
-from mjx_reinforce.export.policy_files import SavedPolicy, save_policy
+from mjx_reinforce.export.policy_files import Player, SavedPolicy, load_seed, save_policy
 from mjx_reinforce.export.run_files import PROVENANCE_FILE, Run, read_run
 from mjx_reinforce.files import read_json, write_json
 from mjx_reinforce.settings.config import as_words

@@ -12,8 +12,7 @@ from experiments.kit.markdown import fixed, percent, table
 from experiments.studies.results import kept
 from experiments.studies.results.kept import POLICIES, Columns, Group, Result
 from experiments.studies.results.tasks import PUBLISHED_SEEDS
-from mjx_reinforce.statistics import Estimate, finite_or_nan, iqm, iqm_interval
-from mjx_reinforce.statistics.aggregates import estimate_mean
+from mjx_reinforce.statistics import Estimate, estimate_mean, finite_or_nan, iqm, iqm_interval
 
 #: Env steps within which the pendulum should be solved.
 WITHIN = (50_000, 100_000)

@@ -9,8 +9,7 @@ import numpy as np
 from scipy import stats
 
 from experiments.studies.seeds.runs import Task
-from mjx_reinforce.statistics import iqm
-from mjx_reinforce.statistics.aggregates import wilson
+from mjx_reinforce.statistics import iqm, wilson
 from mjx_reinforce.statistics.comparisons import (
     Difference,
     holm,

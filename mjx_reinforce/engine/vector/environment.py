@@ -295,17 +295,13 @@ class VectorEnv:
             raise ValueError(
                 f"the state must be what reset or step returned, got a {type(state).__name__}"
             )
-        rows = jnp.shape(state.reward)[:1]
-        if rows != (self.num_envs,):
-            count = f"{rows[0]} environments" if rows else "one environment"
-            raise ValueError(f"the state is of {count}, not of {self.num_envs}")
         same = jax.tree.structure(state) == jax.tree.structure(self._blank)
         pairs = zip(jax.tree.leaves(state), jax.tree.leaves(self._blank), strict=False)
         if not same or any(
             jnp.shape(x) != (self.num_envs, *y.shape) or jnp.result_type(x) != y.dtype
             for x, y in pairs
         ):
-            raise ValueError(f"the state is of another task than {self.env!r}, or was changed")
+            raise ValueError(f"the state is not of {self!r}, or was changed")
 
     def __repr__(self) -> str:
         return (

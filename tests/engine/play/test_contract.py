@@ -66,7 +66,10 @@ def test_a_wider_state_may_be_kept_in_place_of_a_narrower_one_only():
     ("change", "message"),
     [
         ({"init": lambda key: 1 / 0}, r"policy.init\(key\) fails"),
-        ({"apply": lambda params, x: (x @ params)[:, :1]}, r"must return \[2, 2\].*got \[2, 1\]"),
+        (
+            {"apply": lambda params, x: (x @ params)[:, :1]},
+            r"return \[2, 2\].*got float32\[2, 1\]",
+        ),
         ({"apply": lambda params, x: (x @ params).astype(int)}, "floating-point numbers, got int"),
         ({"distribution": 3}, "policy.distribution must be"),
     ],
@@ -77,7 +80,7 @@ def test_a_policy_that_cannot_play_is_named(change, message):
 
 
 def test_a_policy_of_other_actions_is_named():
-    with pytest.raises(ValueError, match=r"draws actions \[2\] .* Toy takes \[2, 1\]"):
+    with pytest.raises(ValueError, match=r"draws actions int32\[2\] .* Toy takes \[2, 1\]"):
         check_policy(tabular_policy(), Toy(), 3)
 
 
