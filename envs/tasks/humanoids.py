@@ -63,14 +63,14 @@ class Humanoid(Person, Healthy):
 
     Observation, O = 348: height of the torso (m), its orientation (quaternion), 17 joint angles
     (rad), 22 in all; their 23 velocities (m/s, rad/s); for each of 13 bodies inertia about the
-    centre of mass, mass offset and mass, 10 each (kg m^2, kg m, kg); angular and linear velocity, 6
+    center of mass, mass offset and mass, 10 each (kg m^2, kg m, kg); angular and linear velocity, 6
     each (rad/s, m/s); 17 motor torques (N m); torque and force of contacts on each body, 6 each
     (N m, N). With ``exclude_current_positions_from_observation=False`` x and y (m) come first.
     Action, A = 17: torques in [-0.4, 0.4] on abdomen y, z, x, right hip x, z, y and knee, left hip
     x, z, y and knee, right shoulder 1, 2 and elbow, left shoulder 1, 2 and elbow, times gears of
     100, hip y 300, knee 200, arms 25 (N m).
 
-    Reward: 1.25 times the speed of the mass centre along x over the step (m/s), plus 5 if healthy,
+    Reward: 1.25 times the speed of the mass center along x over the step (m/s), plus 5 if healthy,
     less 0.1 times the sum of the squared actions and 5e-7 times that of the contact forces, the
     latter at most 10. Start: every position and velocity uniform within ``reset_noise_scale`` of
     standing at rest. Terminates when the torso's height leaves (1, 2) m. No threshold; at most 1000
@@ -94,7 +94,7 @@ class Humanoid(Person, Healthy):
     carried = ("xipos",)
 
     def place(self, data):
-        """Returns x and y of the mass centre [2] (m) at the last forward pass."""
+        """Returns x and y of the mass center [2] (m) at the last forward pass."""
         mass = self.mj_model.body_mass
         return jnp.asarray(mass / mass.sum(), data.xipos.dtype) @ data.xipos[:, :2]
 

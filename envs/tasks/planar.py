@@ -11,7 +11,7 @@ from mjx_reinforce.envs.settings import Interval
 class HalfCheetah(Runner):
     """Gymnasium's HalfCheetah (gymnasium/envs/mujoco/half_cheetah_v5.py).
 
-    Observation, O = 17: height of the torso's centre over its pose (m), pitch of the torso, angles
+    Observation, O = 17: height of the torso's center over its pose (m), pitch of the torso, angles
     of the back thigh, shin and foot and of the front thigh, shin and foot (rad); velocity along x
     and z (m/s), angular velocities in the same order (rad/s). With
     ``exclude_current_positions_from_observation=False`` x (m) comes first, O = 18. Action, A = 6:

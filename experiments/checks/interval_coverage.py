@@ -65,7 +65,7 @@ def rates(draws: int) -> Iterator[tuple[str, str, list[str]]]:
         for num_seeds in SEEDS:
             count = np.random.default_rng(num_seeds).binomial(num_seeds, rate, draws)
             cells.append(share(*wilson(count, num_seeds)[1:], rate))
-        yield "rate (Wilson)", f"{100 * rate:.0f} %", cells
+        yield "rate (Wilson)", f"{100 * rate:.0f}%", cells
 
 
 def _one_luck(random: np.random.Generator, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -116,7 +116,7 @@ def two_samples(draws: int) -> Iterator[tuple[str, str, list[str]]]:
 def paired_rates(draws: int) -> Iterator[tuple[str, str, list[str]]]:
     """Yields the same for the difference of two rates on the same seeds."""
     for first, second, alike in ((0.9, 0.7, 0.5), (0.99, 0.97, 0.5), (1.0, 0.995, 0.0)):
-        name = f"{100 * first:g} % and {100 * second:g} %" + (", same luck" if alike else "")
+        name = f"{100 * first:g}% and {100 * second:g}%" + (", same luck" if alike else "")
         cells = []
         for num_seeds in SEEDS:
             random = np.random.default_rng(num_seeds)
@@ -172,7 +172,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=10_000)
     draws = parser.parse_args().draws
-    print(f"Share of {draws:,} draws whose 95 % interval covers the truth, in percent\n")
+    print(f"Share of {draws:,} draws whose 95% interval covers the truth, in percent\n")
     print("| interval | distribution |", *(f"{n} seeds |" for n in SEEDS))
     print("|---|---|" + "---|" * len(SEEDS))
     for part in (f(draws) for f in (one_sample, rates, two_samples, paired_rates, times)):

@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 
-def percent(share: float, digits: int, unit: str = " %") -> str:
+def percent(share: float, digits: int, unit: str = "%") -> str:
     """Returns a share in percent; nothing where there is none."""
     return "" if math.isnan(share) else f"{fixed(100 * share, digits)}{unit}"
 

@@ -51,7 +51,7 @@ class Training:
     def phase(self) -> str:
         """Returns what it does now."""
         said = self.said()
-        if any(x in said for x in ("100.0 %", f"going on after {UPDATES} updates", "is finished")):
+        if any(x in said for x in ("100.0%", f"going on after {UPDATES} updates", "is finished")):
             return "ending"
         if "compiled in" in said:
             return "writing" if self.parts() else "training"

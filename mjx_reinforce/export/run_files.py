@@ -180,7 +180,7 @@ def pretrained() -> dict[str, dict[str, Any]]:
 
     Returns:
       By the id of the task: ``return``, the mean over ``episodes`` episodes without noise from
-      starts that nothing else used; ``interval``, which covers the mean with 95 %; ``command``,
+      starts that nothing else used; ``interval``, which covers the mean with 95%; ``command``,
       ``git_commit``, ``machine``, ``seconds`` (of training) and ``compile_seconds``; ``env_steps``
       and ``seed`` of the policy; ``seeds``, of how many it is the best; ``horizon`` (env steps).
 

@@ -334,7 +334,7 @@ def check_space(name: str, space: Box | Discrete) -> None:
 
 
 def middle_and_half_range(space: Box) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the centre and half the width of each entry's range, [A] each.
+    """Returns the center and half the width of each entry's range, [A] each.
 
     They are 0 and 1 for an entry that is not bounded on both sides.
     """

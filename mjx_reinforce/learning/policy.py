@@ -68,7 +68,7 @@ def _symmetric_uniform(bound: float) -> nn.initializers.Initializer:
 
 
 class Policy(NamedTuple):
-    """A parametrised distribution over actions, given the observation.
+    """A parametrized distribution over actions, given the observation.
 
     Attributes:
       init: (key) -> params; consumes the key

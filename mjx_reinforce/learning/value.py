@@ -264,6 +264,6 @@ def _moments(
     def mean(x):
         return jnp.sum(jnp.where(mask, x, 0.0)) / jnp.maximum(steps, 1)
 
-    centre = critic.mean + share * (mean(returns) - critic.mean)
-    spread = mean((returns - centre) ** 2)
-    return updates, centre, critic.variance + share * (spread - critic.variance)
+    center = critic.mean + share * (mean(returns) - critic.mean)
+    spread = mean((returns - center) ** 2)
+    return updates, center, critic.variance + share * (spread - critic.variance)

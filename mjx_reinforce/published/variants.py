@@ -68,9 +68,9 @@ def normalized_returns(discount: float | jax.Array = 0.99) -> Estimator:
     def weigh(trajectory):
         mask = trajectory.mask
         returns = discounted_returns(trajectory.reward, discount)
-        centred = jnp.where(mask, returns - _episode_mean(returns, mask), 0.0)
-        variance = jnp.sum(centred**2, axis=0) / jnp.maximum(jnp.sum(mask, axis=0) - 1, 1)
-        normalized = centred / (jnp.sqrt(variance) + float(jnp.finfo(jnp.float32).eps))
+        centered = jnp.where(mask, returns - _episode_mean(returns, mask), 0.0)
+        variance = jnp.sum(centered**2, axis=0) / jnp.maximum(jnp.sum(mask, axis=0) - 1, 1)
+        normalized = centered / (jnp.sqrt(variance) + float(jnp.finfo(jnp.float32).eps))
         return replace_broken(normalized, trajectory.nonfinite)
 
     return stateless(weigh)

@@ -34,16 +34,16 @@ def interval_in_words(estimate: Estimate, form: Callable[[float], str] = number)
 
 
 def within(estimate: Estimate, form: Callable[[float], str] = number) -> str:
-    """Returns an interval with its level, "95 % interval 997.0 to 999.0", or that there is none."""
+    """Returns an interval with its level, "95% interval 997.0 to 999.0", or that there is none."""
     said = interval_in_words(estimate, form)
-    return said if said == "no interval" else f"95 % interval {said}"
+    return said if said == "no interval" else f"95% interval {said}"
 
 
 def percent(share: float) -> str:
-    """Returns a share as a percentage; only all is 100 %, and only none 0 %."""
+    """Returns a share as a percentage; only all is 100%, and only none 0%."""
     if share in (0.0, 1.0):
-        return f"{share:.0%}".replace("%", " %")
-    return f"{min(max(100 * share, 0.1), 99.9):.1f} %"
+        return f"{share:.0%}"
+    return f"{min(max(100 * share, 0.1), 99.9):.1f}%"
 
 
 def steps(value: float) -> str:
@@ -179,7 +179,7 @@ def caveats(findings: Findings) -> Iterator[str]:
     if min(sizes) < _FEW_SEEDS:
         yield (
             f"{counted(min(sizes), 'seed')} of a configuration are few: below {_FEW_SEEDS}, an "
-            "interval holds the truth less often than 95 % of the time; below six there is none."
+            "interval holds the truth less often than 95% of the time; below six there is none."
         )
     if failed := sum(int(np.sum(~np.isfinite(each.final))) for each in results):
         yield (

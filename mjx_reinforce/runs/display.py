@@ -161,9 +161,9 @@ def _time_left(now: record.Progress) -> str:
 
 
 def percent_done(fraction: float) -> str:
-    """Returns a fraction as a percentage with one decimal, rounded down: 100 % is all."""
+    """Returns a fraction as a percentage with one decimal, rounded down: 100% is all."""
     shown = Decimal(repr(fraction)).quantize(Decimal("0.001"), ROUND_DOWN)
-    return f"{100 * shown:.1f} %"
+    return f"{100 * shown:.1f}%"
 
 
 def summary_table(summary: dict[str, Any]) -> Table:
@@ -172,7 +172,7 @@ def summary_table(summary: dict[str, Any]) -> Table:
     table = Table(title=f"{summary['env']}, {num_seeds} seeds", show_header=False)
     low, high = summary["iqm_ci"]
     known = math.isfinite(low) and math.isfinite(high)
-    interval = f"95 % interval {low:.1f} to {high:.1f}" if known else "no interval"
+    interval = f"95% interval {low:.1f} to {high:.1f}" if known else "no interval"
     interval += "" if enough(summary["num_seeds"]) else ": too few seeds"
     table.add_row("return, interquartile mean over seeds", f"{summary['iqm']:.1f}  ({interval})")
     returns = np.array(summary["final_returns"])

@@ -65,7 +65,7 @@ def scalars(rows: Cells) -> dict[str, float]:
 
     For each column: ``iqm``, ``lowest`` (of returns, the worst seed), ``highest``, and ``seed_0``
     and so on, of the first ``MAX_SINGLE_SEEDS``; for the evaluation's return also ``iqm_low`` and
-    ``iqm_high``, its 95 % interval. A value that is not finite counts as less than any other.
+    ``iqm_high``, its 95% interval. A value that is not finite counts as less than any other.
 
     Args:
       rows: of one evaluation.

@@ -24,7 +24,7 @@ class Estimate(NamedTuple):
 
 
 def enough(num_seeds: int, confidence: float = 0.95) -> bool:
-    """Returns whether so many seeds can bear an interval: at 95 %, six can.
+    """Returns whether so many seeds can bear an interval: at 95%, six can.
 
     All seeds lie on one side of the truth, if a seed is as likely to lie on either, with the
     probability 2^(1 - n). No interval within the range of fewer holds the truth as often as it
@@ -222,7 +222,7 @@ def summarize(history: dict[str, np.ndarray], threshold: float | None) -> dict[s
 
     Returns:
       ``final_returns`` [S], NaN of a seed that failed; their interquartile mean ``iqm`` with
-      its 95 % interval ``iqm_ci``, where a failed seed counts as the worst; how many seeds have
+      its 95% interval ``iqm_ci``, where a failed seed counts as the worst; how many seeds have
       that as their last return, ``seeds_nonfinite_at_end``. Then of the threshold, None without
       one: how many seeds reached it in their last evaluation, ``seeds_solved_at_end``, also as a
       fraction, ``solve_rate``; how many in any evaluation, ``seeds_ever_solved``; and

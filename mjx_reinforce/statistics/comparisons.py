@@ -119,7 +119,7 @@ def paired_difference(x: ArrayLike, y: ArrayLike, confidence: float = 0.95) -> D
     """Returns how much higher the mean of x is than that of y on the same seeds: paired t-test.
 
     The test knows only the pairs that it can tell apart, those that differ. That all K of them
-    favour the same one has the probability 2^(1 - K) without any difference, so p is no less.
+    favor the same one has the probability 2^(1 - K) without any difference, so p is no less.
 
     Args:
       x: [..., S] values of one configuration. A seed that failed counts as the worst finite value
@@ -216,7 +216,7 @@ def seeds_needed(
 
     It is the least number at which Welch's t-test of so many seeds, drawn with replacement from x
     and from y, names the better one at the level ``alpha`` with the probability ``power``; four
-    at 5 %, or more, because of fewer no order is rare enough.
+    at 5%, or more, because of fewer no order is rare enough.
 
     Args:
       x: [S] values of one configuration, of many seeds; a seed that failed counts as the worst

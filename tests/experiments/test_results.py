@@ -141,7 +141,7 @@ def test_the_tables_of_both_pages(folder):
         "| [video](films/Hopper-v5-best.gif) |\n| Hopper-v5 | median (3) |",
         "| InvertedPendulum-v5 | 2 | 90,000 | 6.00 (",
         "| 4.00 | 1 of 2 (5) | 1,000.0 (1,000.0 to 1,000.0) | no interval | 10.0 min, 3.0 s | ",
-        "| linear | 2 | 50.00 % (1) | 100.00 % (2) | 30,000 | 60,000 |",
+        "| linear | 2 | 50.00% (1) | 100.00% (2) | 30,000 | 60,000 |",
     ):
         assert line in page
     assert "Reacher" not in page

@@ -124,7 +124,7 @@ def test_the_tables_say_what_the_numbers_are(tasks, tmp_path, monkeypatch):
     seeds.write([tmp_path / task.name for task in tasks], page)
     text = page.read_text()
     assert "before" not in text
-    assert "| Up-v0 | 0 | 50 | 32 and 32 | 1,000 | 0.0 % | 0 | vmap | 1 s, 2 s |" in text
+    assert "| Up-v0 | 0 | 50 | 32 and 32 | 1,000 | 0.0% | 0 | vmap | 1 s, 2 s |" in text
     row = next(x for x in text.splitlines() if x.startswith(f"| {LEARNED.name} | Up-v0 |"))
     assert "**+5." in row
     assert row.endswith("| 100 |")

@@ -153,9 +153,9 @@ NORMAL = stats.norm.ppf((np.arange(2000) + 0.5) / 2000)
 
 @pytest.mark.parametrize(("effect", "expected"), [(1.0, 17), (-0.5, 64), (0.3, 176)])
 def test_seeds_needed_are_those_of_the_t_test(effect, expected):
-    """Cohen (1988), table 2.4: 17, 64 and 175 of each for a power of 80 % at 5 %.
+    """Cohen (1988), table 2.4: 17, 64 and 175 of each for a power of 80% at 5%.
 
-    Power is estimated from 2000 draws, so it is 0.009 off, and the seeds are by 2.3 %.
+    Power is estimated from 2000 draws, so it is 0.009 off, and the seeds are by 2.3%.
     """
     found = seeds_needed(NORMAL + effect, NORMAL)
     assert found == pytest.approx(expected, rel=0.07, abs=1)

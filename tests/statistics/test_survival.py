@@ -53,7 +53,7 @@ def test_median_by_hand():
 
 
 def test_median_interval_is_between_order_statistics():
-    """Of a hundred, the 40th and the 61st cover with 96.5 %, the 41st and the 60th with 94.3 %."""
+    """Of a hundred, the 40th and the 61st cover with 96.5%, the 41st and the 60th with 94.3%."""
     value, low, high = median_steps(np.arange(1, 101), np.full(100, True))
     assert value == 50
     assert low in (40, 41)

@@ -179,7 +179,7 @@ def test_a_block_of_broken_updates_is_one_line():
 
 
 def test_percentages_are_rounded_down():
-    shown = {1.0: "100.0 %", 1 - 1e-12: "99.9 %", 0.57: "57.0 %", 0.29: "29.0 %", 1e-5: "0.0 %"}
+    shown = {1.0: "100.0%", 1 - 1e-12: "99.9%", 0.57: "57.0%", 0.29: "29.0%", 1e-5: "0.0%"}
     assert {fraction: display.percent_done(fraction) for fraction in shown} == shown
 
 
@@ -197,7 +197,7 @@ def test_a_progress_line_fits_in_80_columns(monkeypatch):
         shown.start(1.0)
         shown.show_progress(Progress(0.4567, 12, 3e4, 12345.6, np.nan, 3, 1000, 123456.0, 45296.0))
     written = console.file.getvalue()
-    for text in ("45.6 %", "0:00:00", "left 12:34:56", "return 12345.6"):
+    for text in ("45.6%", "0:00:00", "left 12:34:56", "return 12345.6"):
         assert text in written
     assert "worst nan (3 of 1,000 seeds)  123,456 steps/s\n" in written
     assert "…" not in written
@@ -209,8 +209,8 @@ def test_without_a_terminal_an_evaluation_is_one_line(monkeypatch, capsys):
         shown.show_progress(Progress(0.0, 0, 0, 8.0, 7.0, 0, 2, np.nan, np.nan))
         shown.show_progress(Progress(0.25, 5, 4e4, 9.5, 7.0, 0, 2, 1000.0, 59.2))
     first, second = capsys.readouterr().out.splitlines()
-    assert first.endswith("return     8.0  worst     7.0  0.0 %")
-    assert second.endswith("worst     7.0  1,000 steps/s  25.0 %  left 0:01:00")
+    assert first.endswith("return     8.0  worst     7.0  0.0%")
+    assert second.endswith("worst     7.0  1,000 steps/s  25.0%  left 0:01:00")
 
 
 @pytest.mark.parametrize("width", [60, 200])
@@ -254,10 +254,10 @@ def test_the_end_table_has_counts(monkeypatch):
         "seeds at 950, the task's threshold │ 997 of 1,000 at the end, 997 ever",
         "last policies on fresh starts │ 584.4",
         "best policies on fresh starts │ 572.0 (their evaluation was luck)",
-        "99.9 %",
+        "99.9%",
     ):
         assert text in written
-    assert "(95 %" in written
+    assert "(95%" in written
     assert "nan, 1000.0" in written
     assert "not finite │ 1 of 1,000" in written
     assert "Files in t/[bold]x" in written

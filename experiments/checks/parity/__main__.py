@@ -9,7 +9,7 @@ same distribution; whether a fixed policy earns the same distribution of returns
 Gymnasium lacks is compared with a transcription of the document it comes from.
 
 The states are those that random actions reach from a reset, and as many pushed from there: onto the
-joints' limits and past them, faster, into the floor, over the point of falling. Actions go 20 %
+joints' limits and past them, faster, into the floor, over the point of falling. Actions go 20%
 beyond their bounds.
 """
 

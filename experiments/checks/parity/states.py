@@ -33,7 +33,7 @@ def draw_states(
 
 
 def random_action(space: Any, random: np.random.Generator) -> np.ndarray:
-    """Draws an action, of a Box up to 20 % beyond its bounds."""
+    """Draws an action, of a Box up to 20% beyond its bounds."""
     if isinstance(space, Discrete):
         return random.integers(space.num_actions)  # type: ignore
     return random.uniform(1.2 * space.low, 1.2 * space.high)

@@ -51,7 +51,7 @@ def main() -> None:
             print(f"{title}\n\n{table([key.replace('_', ' ') for key in rows[0]], cells)}\n")
     print(
         f"agrees: p >= {LEVEL}, of a rank test over seeds by permutation, two-sided. "
-        f"Low, high: 2.5 and 97.5 % of our {settings.seeds} seeds; inside: of theirs, between them."
+        f"Low, high: 2.5 and 97.5% of our {settings.seeds} seeds; inside: of theirs, between them."
     )
 
 

@@ -9,7 +9,7 @@ from scipy import stats
 from experiments.studies.reproduce.cases import Case
 from mjx_reinforce.settings.defaults import PRESETS
 
-LEVEL = 0.05  # of the tests; the range over seeds holds 95 % too
+LEVEL = 0.05  # of the tests; the range over seeds holds 95% too
 
 
 def windowed(scores: np.ndarray, count: int, window: int) -> np.ndarray:
@@ -33,7 +33,7 @@ def rank_test(ours: np.ndarray, theirs: np.ndarray) -> float:
 
 
 def spread(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the 2.5 and 97.5 % quantiles over seeds, the last axis."""
+    """Returns the 2.5 and 97.5% quantiles over seeds, the last axis."""
     low, high = np.quantile(values, [LEVEL / 2, 1 - LEVEL / 2], axis=-1)
     return low, high
 

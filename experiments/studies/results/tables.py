@@ -39,7 +39,7 @@ def seconds(x: float) -> str:
 
 
 def published_interval(mean: float, deviation: float) -> Estimate:
-    """Returns a published mean with its 95 % interval by Student's t over the published seeds."""
+    """Returns a published mean with its 95% interval by Student's t over the published seeds."""
     t = stats.t.ppf(0.975, PUBLISHED_SEEDS - 1)
     half = float(t) * deviation / math.sqrt(PUBLISHED_SEEDS)
     return Estimate(mean, mean - half, mean + half)
@@ -66,8 +66,8 @@ def verdict(ours: Estimate, published: tuple[float, float] | None) -> str:
 
 def of_tasks(results: Sequence[Result]) -> str:
     """Returns the table of all tasks by env steps."""
-    header = ["task", "seeds", "env steps per seed", "IQM (95 %)", "mean (95 %)", "worst seed"]
-    header += ["solved at the end (threshold)", "published (95 %)", "our mean is"]
+    header = ["task", "seeds", "env steps per seed", "IQM (95%)", "mean (95%)", "worst seed"]
+    header += ["solved at the end (threshold)", "published (95%)", "our mean is"]
     return table([*header, "training, compiling", "machine"], map(_result_row, results))
 
 
@@ -109,7 +109,7 @@ def pendulum(results: Sequence[Result]) -> str:
             ]
         )
     header = ["policy", "seeds", *(f"solved within {limit:,}" for limit in WITHIN)]
-    return table([*header, "median env steps to solve", "99 % of seeds within"], rows)
+    return table([*header, "median env steps to solve", "99% of seeds within"], rows)
 
 
 def _steps(x: float) -> str:
@@ -133,7 +133,7 @@ def gpu(groups: Sequence[Group], docs: Path) -> str:
         for group in groups
         if group.is_gpu
     ]
-    header = ["task", "on", "seeds", "after a minute: mean, worst", "at the end: mean (95 %)"]
+    header = ["task", "on", "seeds", "after a minute: mean, worst", "at the end: mean (95%)"]
     header += ["worst", "best seed", "seconds, all seeds", "env steps per seed", "PPO, published"]
     return table([*header, "SAC, published"], rows)
 

@@ -20,7 +20,7 @@ class FewSeeds(NamedTuple):
     """What few seeds would have said of two arms, each at its best learning rate.
 
     wrong: how often the mean of so many seeds of each names the wrong one
-    needed: seeds of each with which a t-test finds the difference in 80 % of cases; None above
+    needed: seeds of each with which a t-test finds the difference in 80% of cases; None above
       10,000
     adjusted: the p value of no difference, of all seeds together, after Holm's correction for all
       of these

@@ -67,7 +67,7 @@ def few_table(found: Sequence[FewSeeds]) -> str:
             cells = ["yes" if x.sure else "no", *wrong, number(x.needed)]
         rows.append([x.measure, x.task, x.contrast, *cells])
     header = ["by the mean", "task", "", "sure winner", *(f"{n} seeds (%)" for n in FEW)]
-    return table([*header, "seeds for 80 % power"], rows)
+    return table([*header, "seeds for 80% power"], rows)
 
 
 def pairs_table(found: Sequence[AnyPair]) -> str:

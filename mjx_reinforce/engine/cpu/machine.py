@@ -202,7 +202,7 @@ def _effort(text: str) -> int:
     """Returns LLVM's level of effort for a text.
 
     A long program compiles in two thirds of the time with less effort, and runs as fast (Ant,
-    Humanoid); a short one may run slower (Hopper: 4 %).
+    Humanoid); a short one may run slower (Hopper: 4%).
     """
     return 1 if len(text) > _LONG_TEXT else 2
 

@@ -45,7 +45,7 @@ from mjx_reinforce.engine.physics.rows import make_constraint
 from mjx_reinforce.engine.scalar import is_written_out, short_scan
 
 # What C takes for zero (mjMINVAL); in single precision, what rounding may leave of a zero distance
-# between points a few metres from the origin. Axes that cross, as in a planar Hopper, have that.
+# between points a few meters from the origin. Axes that cross, as in a planar Hopper, have that.
 _MIN_LENGTH = {"float64": 1e-15, "float32": 2e-6}
 # Capsules are parallel in C (``mjc_segWeights``) below this square of their angle's sine.
 _PARALLEL = 1e-8

@@ -158,7 +158,7 @@ def _free_bodies(model: mjx.Model) -> list[int]:
 
 def _bias_derivative(model: mjx.Model, data: mjx.Data, body: int, dofs: np.ndarray) -> jax.Array:
     """Returns the derivative of a free body's ``qfrc_bias`` by its turning, [6, 3]."""
-    # With all that is fixed to it, about the centre of mass.
+    # With all that is fixed to it, about the center of mass.
     inertia = jax_fields(data).crb[body][np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])]
     frame, arm = data.xmat[body].reshape(3, 3), data.subtree_com[body] - data.xpos[body]
 

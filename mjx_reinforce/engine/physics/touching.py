@@ -57,7 +57,7 @@ def _room(model: mjx.Model) -> int:
     """Returns for how many contacts of each kind there is room.
 
     More room costs time in every solve. Of the states that random and trained policies led to, more
-    than 99.9 % had room (700 to 24,000 states a task).
+    than 99.9% had room (700 to 24,000 states a task).
     """
     return math.ceil(0.4 * model.nv)
 

@@ -38,12 +38,12 @@ _LOOK = json.loads(
 LIGHT, DARK = _LOOK["light"], _LOOK["dark"]
 #: How all charts look, for Vega-Lite.
 CONFIG = _LOOK["config"]
-_NUM_COLOURS = sum(name.startswith("series-") for name in LIGHT)
+_NUM_COLORS = sum(name.startswith("series-") for name in LIGHT)
 
 
 def color(place: int) -> str:
     """Returns the color of the configuration at a place."""
-    return f"var(--series-{place % _NUM_COLOURS})"
+    return f"var(--series-{place % _NUM_COLORS})"
 
 
 def dash(place: int) -> list[int]:

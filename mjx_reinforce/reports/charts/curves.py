@@ -40,7 +40,7 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         name="curves",
         title="Learning curves",
         caption=(
-            "The interquartile mean over seeds of the return without exploration, and its 95 % "
+            "The interquartile mean over seeds of the return without exploration, and its 95% "
             "bootstrap interval; with one configuration shown, thin lines are single seeds, from "
             "worst to best. The dotted line is the slider's time below. Point at a curve to read "
             f"it.{beyond}"
@@ -75,7 +75,7 @@ def picture(env: str, threshold: float | None, history: dict[str, np.ndarray]) -
         axes.axhline(threshold, color="0.3", linestyle="--", linewidth=1, label="solved")
         axes.legend(frameon=False)
     shown = f"interquartile mean of {seeds} seeds" if seeds > 1 else "1 seed"
-    shown += " and its 95 % interval" if enough(seeds) else ""
+    shown += " and its 95% interval" if enough(seeds) else ""
     axes.set(title=f"{env}: {shown}", xlabel="env steps per seed", ylabel=_RETURN)
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.grid(alpha=0.3)

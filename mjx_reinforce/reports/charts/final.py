@@ -26,7 +26,7 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         name="final",
         title="The final return",
         caption=(
-            "Points are means over seeds, thick lines their 95 % intervals, and pale bars the "
+            "Points are means over seeds, thick lines their 95% intervals, and pale bars the "
             "middle eight tenths of the seeds."
         ),
         alt=(
@@ -48,7 +48,7 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
 def _rows(findings: Findings) -> charts.Spec:
     said = {
         "value": "mean over seeds",
-        "low": "95 % from",
+        "low": "95% from",
         "high": "to",
         "tenth": "a tenth of the seeds below",
         "ninetieth": "a tenth above",

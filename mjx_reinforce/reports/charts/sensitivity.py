@@ -37,7 +37,7 @@ def _lines(data: str, x: charts.Spec) -> charts.Spec:
     title = "mean final return"
     value = charts.quantity("value", title=title, scale={"zero": False, "padding": 8})
     interval = {"y": charts.quantity("low", title=title), "y2": {"field": "high"}}
-    said = {"value": "mean return", "low": "95 % from", "high": "to"}
+    said = {"value": "mean return", "low": "95% from", "high": "to"}
     tips = charts.tooltip(**{field: (name, ",.1f") for field, name in said.items()})
     joined = {"y": value, "detail": {"field": "others"}, "strokeWidth": if_best(2.6, 1)}
     paint = if_best("var(--series-0)", "var(--soft)")

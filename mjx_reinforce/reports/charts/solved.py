@@ -24,7 +24,7 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         title="How many have solved it",
         caption=(
             f"The share of seeds that have reached {number(findings.experiment.threshold or 0.0)} "
-            "at least once, after Kaplan and Meier, with its pointwise 95 % interval. A seed that "
+            "at least once, after Kaplan and Meier, with its pointwise 95% interval. A seed that "
             "fell back later still counts here; table 1 says how many did. The curve's last "
             "point is the end of each seed's training."
         ),
@@ -39,7 +39,7 @@ def _bands_and_lines(findings: Findings) -> charts.Spec:
     tips = charts.tooltip(
         env_steps=("env steps", ",.0f"),
         share=("have solved", ".1%"),
-        low=("95 % from", ".1%"),
+        low=("95% from", ".1%"),
         high=("to", ".1%"),
     )
     band = {"y": charts.quantity("low", title=title), "y2": {"field": "high"}}

@@ -160,7 +160,7 @@ TWO_LINKS = (
 #: What has more degrees of freedom: bodies, actuators, tendons.
 OTHERS = {
     "free": ('<freejoint name="{0}"/>' + BOX, "", ""),
-    "free, off its centre": ('<joint name="{0}" type="free" armature=".1"/>'
+    "free, off its center": ('<joint name="{0}" type="free" armature=".1"/>'
         '<geom type="box" size=".1 .2 .3" pos=".2 .1 0" euler="20 30 0"/>', "", ""),
     "free, driven": ('<freejoint name="{0}"/><geom type="box" size=".1 .2 .3" pos=".1 0 0"/>'
         '<site name="{0}" pos=".2 0 0"/>', '<general site="{0}" refsite="world" '
@@ -197,7 +197,7 @@ OTHERS = {
         '<joint joint="{0} a" coef="2"/></fixed>'),
 }  # fmt: skip
 #: What machine code plays, which takes minutes to compile with all.
-FEW = (*HINGES, "free, off its centre", "tendon at its limit")
+FEW = (*HINGES, "free, off its center", "tendon at its limit")
 
 
 def compiled(chosen):
