@@ -2,16 +2,15 @@
 
 import dataclasses
 import functools
+import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
 from typing import Any
 
-import numpy as np
-
+from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.learning import counts
-from mjx_reinforce.reports.experiment import counted, say, setting_in_words
-from mjx_reinforce.runs.display import Display
+from mjx_reinforce.learning.policy import Actor
+from mjx_reinforce.runs.display import Display, SweepScreen
 from mjx_reinforce.runs.plan import Part, Prepared
 from mjx_reinforce.runs.saving import Files
 from mjx_reinforce.settings.config import MAX_COUNT, Config
@@ -19,135 +18,93 @@ from mjx_reinforce.store.ready import Ready
 from mjx_reinforce.training.driver import Driver, Observer, Runs, Training, check_layout
 from mjx_reinforce.training.record import HOPELESS, Record, RunRecord
 from mjx_reinforce.training.resume import Checkpoint
-from mjx_reinforce.training.slots import Compiled, Slots, compile_slots, started
-from mjx_reinforce.training.state import Budget, begin_with, budget_of, last_actors
+from mjx_reinforce.training.slots import Compiled, Slots, Stopwatch, compile_slots, started
+from mjx_reinforce.training.state import Budget, begin_with, budget_of
 
 
-class Conductor(Observer[Training]):
-    """Trains the chunks that have not ended yet, and lets observers see them."""
+def conduct(
+    prepared: Prepared,
+    files: Files[Any] | None,
+    display: Display,
+    observers: Sequence[Observer[Any]],
+    interrupt: Interrupt,
+) -> tuple[Training | None, dict[str, Any]]:
+    """Trains the chunks that have not ended yet, to their end or until they are interrupted.
 
-    def __init__(
-        self,
-        prepared: Prepared,
-        files: Files[Any] | None,
-        display: Display,
-        observers: Sequence[Observer[Any]],
-    ):
-        """Takes what is trained.
+    Args:
+      prepared: what a run or a sweep is made of.
+      files: of it, if it has any.
+      display: its screen.
+      observers: who sees it, besides these.
+      interrupt: what listens to signals.
 
-        Args:
-          prepared: what a run or a sweep is made of.
-          files: of it, if it has any.
-          display: its screen.
-          observers: who sees it, besides these.
-        """
-        self._prepared, self._files, self._display = prepared, files, display
-        written = [] if files is None else [files]
-        self._observers = [*written, display if prepared.alone else self, *observers]
-        self._clock = prepared.clock
-        #: The groups that have runs to be trained, and these in chunks.
-        self._stages: list[tuple[Part, list[Runs]]] = []
-        for part in prepared.parts:
-            if left := [x for x in part.chunks if not (files is not None and files.has(x.name))]:
-                self._stages.append((part, left))
-        #: Runs that have ended here, what checkpoints brought of them, and of how many.
-        self._done, self._brought = 0, 0.0
-        self._total = sum(len(x.seed) for _, left in self._stages for x in left)
-        #: The programs of the group that is next.
-        self._next: Future[Compiled] = Future()
+    Returns:
+      The runs that were trained last, if any were, and the contents of the last file.
 
-    def compile_first(self) -> None:
-        """Compiles the programs of the first group, if any runs are left, as the caller would."""
-        if self._stages:
-            self._next.set_result(self._compile(self._stages[0][0]))
-        self._clock.compiling = time.perf_counter() - self._clock.began
-
-    def conduct(self, interrupted: Callable[[], bool]) -> tuple[Training | None, dict[str, Any]]:
-        """Trains all groups, to their end or until they are interrupted.
-
-        Returns:
-          The runs that were trained last, if any were, and the contents of the last file.
-
-        Raises:
-          OSError: the first or the last files cannot be written.
-        """
-        if self._files is not None:
-            self._files.open()
-        self._display.start(self._clock.compiling)
-        driver, ended = None, True
-        for part, runs, compiled in self._chunks():
-            driver = self._begin(part, runs, compiled, interrupted)
-            driver.drive(interrupted)
-            for observer in self._observers:
-                observer.ended(driver)
-            ended = driver.record.done()
-            if not ended:
-                break
-            self._done += len(runs.seed)
-        if isinstance(driver, Driver):
-            # A signal after that changes nothing: what is left takes a second or two.
-            test, engine = driver.test(interrupted), self._prepared.parts[0].ready.engine
-            summary = summary_of(driver, engine, self._clock.compiling, test)
-        else:
-            assert self._files is not None
-            summary = dict(self._files.contents, status="finished" if ended else "interrupted")
-            summary["compile_seconds"] += self._clock.compiling
-            summary["run_seconds"] += self._clock.running()
-        for observer in self._observers:
-            observer.finished(driver, summary)
-        return driver, summary
-
-    def began(self, driver: Training) -> None:
-        """Remembers how far a sweep's runs are that go on."""
-        self._brought += np.minimum(driver.record.used(), 1.0).sum()
-
-    def updated(self, driver: Training, met: np.ndarray) -> None:
-        """Shows how far a sweep is."""
-        done = self._done + np.minimum(driver.record.used(), 1.0).sum()
-        fraction, gained = float(done / self._total), float(done - self._brought) / self._total
-        now = driver.record.measure(fraction, driver.seconds(), gained, self._clock.running())
-        self._display.show_progress(now)
-
-    def _compile(self, part: Part) -> Compiled:
-        """Returns the programs of a group."""
-        return compile_slots(part.ready.programs(), part.group.config, part.width)
-
-    def _chunks(self) -> Iterator[tuple[Part, Runs, Compiled]]:
-        """Yields the chunks that are left, with the programs of their group."""
-        for number, (part, left) in enumerate(self._stages, start=1):
-            compiled = self._clock.wait(self._next)
-            for following, _ in self._stages[number : number + 1]:
-                self._next = started(functools.partial(self._compile, following))
-            for runs in left:
-                yield part, runs, compiled
-
-    def _begin(
-        self, part: Part, runs: Runs, compiled: Compiled, interrupted: Callable[[], bool]
-    ) -> Training:
-        """Returns the runs of a chunk where they go on; says which they are."""
+    Raises:
+      OSError: the first or the last files cannot be written.
+    """
+    written = [] if files is None else [files]
+    left = [
+        part._replace(chunks=[x for x in part.chunks if not any(f.has(x.name) for f in written)])
+        for part in prepared.parts
+    ]
+    screen = display if prepared.alone else SweepScreen(display, prepared, left)
+    everyone, clock = [*written, screen, *observers], prepared.clock
+    chunks = _compiled([part for part in left if part.chunks], clock)
+    first = [*itertools.islice(chunks, 1)]
+    clock.compiling = time.perf_counter() - clock.began
+    # Not before: a kill while it compiles leaves nothing that would refuse the next.
+    interrupt.defer(display.say)
+    for each in written:
+        each.open()
+    display.start(clock.compiling)
+    driver = None
+    for part, runs, compiled in itertools.chain(first, chunks):
         config = dataclasses.replace(part.group.config, num_seeds=len(runs.seed))
         settings = {name: values[runs.place] for name, values in part.group.settings.items()}
-        slots, say = Slots(compiled, runs.seed, settings), self._display.say
-        if self._prepared.alone:
-            given = config, part.ready, slots, runs, self._prepared.found, say
-            driver = begin_run(*given, self._observers, interrupted)
+        slots = Slots(compiled, runs.seed, settings)
+        if prepared.alone:
+            given = config, part.ready, slots, runs, prepared.found, prepared.actors
+            driver = begin_run(*given, display.say, everyone, interrupt.heard)
         else:
-            driver = Training(config, slots, Record(config), runs, self._observers)
-        for observer in self._observers:
+            driver = Training(config, slots, Record(config), runs, everyone)
+        for observer in everyone:
             observer.began(driver)
-        if not self._prepared.alone:
-            say(self._heading(runs))
-        return driver
+        driver.drive(interrupt.heard)
+        for observer in everyone:
+            observer.ended(driver)
+        if not driver.record.done():
+            break
+    if isinstance(driver, Driver):
+        # A signal after that changes nothing: what is left takes a second or two.
+        test, engine = driver.test(interrupt.heard), prepared.parts[0].ready.engine
+        summary = summary_of(driver, engine, clock.compiling, test)
+    else:
+        assert files is not None
+        ended = driver is None or driver.record.done()
+        summary = dict(files.contents, status="finished" if ended else "interrupted")
+        summary["compile_seconds"] += clock.compiling
+        summary["run_seconds"] += clock.running()
+    for observer in everyone:
+        observer.finished(driver, summary)
+    return driver, summary
 
-    def _heading(self, runs: Runs) -> str:
-        """Returns which configurations the lines that follow are of."""
-        every = self._prepared.design.configurations
-        here = [every[number] for number in np.unique(runs.configuration)]
-        values = {name: [*dict.fromkeys(say(values[name]) for values in here)] for name in here[0]}
-        count = f"{counted(len(here), 'configuration')} of {len(every):,}"
-        few = {name: x if len(x) < 5 else (x[0], "...", x[-1]) for name, x in values.items()}
-        said = (f"{setting_in_words(name)} {', '.join(x)}" for name, x in few.items())
-        return f"{'; '.join(said)} ({count}, {counted(len(runs.seed), 'run')})"
+
+def _compiled(parts: Sequence[Part], clock: Stopwatch) -> Iterator[tuple[Part, Runs, Compiled]]:
+    """Yields chunks with the programs of their group; those of the next compile meanwhile."""
+    waiting = [functools.partial(_compile, part) for part in parts[:1]]
+    for number, part in enumerate(parts, start=1):
+        compiled = clock.wait(waiting.pop())
+        following = [functools.partial(_compile, later) for later in parts[number : number + 1]]
+        waiting = [started(task).result for task in following]
+        for runs in part.chunks:
+            yield part, runs, compiled
+
+
+def _compile(part: Part) -> Compiled:
+    """Returns the programs of a group."""
+    return compile_slots(part.ready.programs(), part.group.config, part.width)
 
 
 def begin_run(
@@ -156,6 +113,7 @@ def begin_run(
     slots: Slots,
     runs: Runs,
     found: Checkpoint | None = None,
+    actors: Actor | None = None,
     say: Callable[[str], None] = lambda text: None,
     observers: Sequence[Observer[Any]] = (),
     interrupted: Callable[[], bool] = lambda: False,
@@ -168,14 +126,15 @@ def begin_run(
       slots: its seeds.
       runs: the same, by their numbers.
       found: the checkpoint from which it goes on, if any; an observer takes it back there.
+      actors: [S, ...] with which it begins, if not with its own.
       say: shows a line to the user.
       observers: who sees it.
       interrupted: whether it is to end soon.
     """
     if found is not None:
         check_layout(found, slots)  # before a file is touched
-    if config.init_from is not None and found is None:
-        slots.restore(begin_with(slots.states(), last_actors(config, ready.policy)))
+    if actors is not None:
+        slots.restore(begin_with(slots.states(), actors))
     if config.minutes is not None:
         first = slots.rows()
         if found is not None:

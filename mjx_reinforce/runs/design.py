@@ -8,7 +8,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_origin
 
 import tyro
 
@@ -266,7 +266,7 @@ def _value(name: str, word: str) -> Any:
     kind = (int | float | str) if _of_env(name) else _FIELDS[name].type
     with contextlib.suppress(ValueError):
         return read_as(kind, word)
-    spaces = "; write spaces between values" if "," in word else ""
-    raise ValueError(
-        f"--over {spoken(name)} has the value {word!r}, not {spoken_kind(kind)}{spaces}"
-    )
+    wanted = f"{spoken_kind(kind)}{'; write spaces between values' if ',' in word else ''}"
+    if get_origin(kind) is tuple:
+        wanted = "layers, such as 32,32, or none"
+    raise ValueError(f"--over {spoken(name)} has the value {word!r}, not {wanted}")

@@ -16,10 +16,12 @@ from rich.table import Table
 from rich.text import Text
 
 from mjx_reinforce.console.commands import command
+from mjx_reinforce.files import Arrays
+from mjx_reinforce.reports.experiment import counted, say, setting_in_words
+from mjx_reinforce.runs.plan import Part, Prepared
 from mjx_reinforce.statistics import enough, iqm
 from mjx_reinforce.training import record
-from mjx_reinforce.training.driver import Driver, Evaluation, Observer
-from mjx_reinforce.training.record import Cells
+from mjx_reinforce.training.driver import Driver, Evaluation, Observer, Training
 
 
 class _Bar(Progress):
@@ -138,9 +140,43 @@ class Display(Observer[Driver]):
             said = record.describe_nonfinite(met, driver.config.first_seed, driver.updates())
             self.say(said, "yellow")
 
-    def evaluated(self, driver: Driver, evaluation: Evaluation, rows: Cells) -> None:
+    def evaluated(self, driver: Driver, evaluation: Evaluation, rows: Arrays) -> None:
         """Shows how far the run is and how well it does."""
         self.show_progress(driver.record.progress())
+
+
+class SweepScreen(Observer[Training]):
+    """Shows how far a sweep is, and which of its runs are trained."""
+
+    def __init__(self, display: Display, prepared: Prepared, parts: Iterable[Part]):
+        """Takes the display, the sweep, and what of it is to be trained."""
+        self._display, self._prepared = display, prepared
+        #: Runs that have ended here, what checkpoints brought of them, and of how many.
+        self._done, self._brought = 0, 0.0
+        self._total = sum(len(runs.seed) for part in parts for runs in part.chunks)
+
+    def began(self, driver: Training) -> None:
+        """Says which configurations the lines that follow are of."""
+        self._brought += driver.record.used_up()
+        runs, every = driver.runs, self._prepared.design.configurations
+        here = [every[number] for number in np.unique(runs.configuration)]
+        values = {name: [*dict.fromkeys(say(values[name]) for values in here)] for name in here[0]}
+        count = f"{counted(len(here), 'configuration')} of {len(every):,}"
+        few = {name: x if len(x) < 5 else (x[0], "...", x[-1]) for name, x in values.items()}
+        said = (f"{setting_in_words(name)} {', '.join(x)}" for name, x in few.items())
+        self._display.say(f"{'; '.join(said)} ({count}, {counted(len(runs.seed), 'run')})")
+
+    def updated(self, driver: Training, met: np.ndarray) -> None:
+        """Shows how far it is."""
+        done = self._done + driver.record.used_up()
+        fraction, gained = float(done / self._total), float(done - self._brought) / self._total
+        running = self._prepared.clock.running()
+        now = driver.record.measure(fraction, driver.seconds(), gained, running)
+        self._display.show_progress(now)
+
+    def ended(self, driver: Training) -> None:
+        """Counts the runs."""
+        self._done += len(driver.runs.seed)
 
 
 def _returns_and_speed(now: record.Progress) -> str:

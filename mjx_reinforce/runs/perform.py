@@ -35,18 +35,20 @@ _ROOM = 2**20
 
 
 def _make(directory: Path) -> None:
-    """Makes the directory of a run, or raises OSError.
-
-    Raises:
-      ValueError: it is not empty, or is in that of another run.
-    """
+    """Makes the directory of a run, or raises OSError; ValueError if it is in that of another."""
     if (outer := _run_around(directory)) is not None:
         raise ValueError(
             f"the run directory {directory} would be inside the run {outer}; choose another "
             "--output"
         )
+    if directory.is_symlink():
+        directory.stat()  # says why it leads nowhere
     directory.mkdir(parents=True, exist_ok=True)
-    # Where a run was killed as it wrote its first file, nothing was begun.
+
+
+def _check_unbegun(directory: Path) -> None:
+    """Raises ValueError if anything was begun in a directory."""
+    # Where a run was killed as it wrote its first file, nothing was.
     if any(not path.name.startswith(_FIRST) for path in directory.iterdir()):
         raise ValueError(
             f"the run directory {directory} is not empty; choose another --output, or delete it"
@@ -105,6 +107,8 @@ def own_directory(directory: Path, interrupt: Interrupt, *, resumed: bool) -> It
     with locked(directory):  # a folder in which another trains stays
         interrupt.on_exit(lambda: remove_empty(made))
         try:
+            if not resumed:
+                _check_unbegun(directory)  # not before: another may have been quicker
             yield
         finally:
             remove_empty(made)
@@ -167,6 +171,7 @@ def perform(
 
     Raises:
       ValueError: the design makes no sense here, or it cannot go on.
+      ImportError: a library is broken, or finds no memory.
       OSError: the first or the last files cannot be written.
     """
     check_design(design)
@@ -180,10 +185,13 @@ def perform(
         # A module of the user's is imported before JAX starts, which it may set up.
         first = design.configs[0]
         env = None if envs.is_ours(first.env) else envs.make_set(first.env, first.env_set)
-        configure_jax()
-        from mjx_reinforce.runs.conduct import Conductor
-        from mjx_reinforce.runs.plan import describe, prepare
-        from mjx_reinforce.runs.saving import RunFiles, SweepFiles
+        try:
+            configure_jax()
+            from mjx_reinforce.runs.conduct import conduct
+            from mjx_reinforce.runs.plan import describe, prepare
+            from mjx_reinforce.runs.saving import RunFiles, SweepFiles
+        except MemoryError as error:
+            raise ImportError(f"no memory is left {error}".strip()) from error
 
         display = _display(quiet=quiet)
         interrupt.restore_screen(display.console.show_cursor)
@@ -193,11 +201,7 @@ def perform(
         with display:
             kind = SweepFiles if design.over else RunFiles
             written = None if directory is None else kind(directory, prepared, display.say)
-            conductor = Conductor(prepared, written, display, observers)
-            conductor.compile_first()
-            # Not before: a kill while it compiles leaves nothing that would refuse the next.
-            interrupt.defer(display.say)
-            driver, summary = conductor.conduct(interrupt.heard)
+            driver, summary = conduct(prepared, written, display, observers, interrupt)
         return Outcome(directory, summary, driver, prepared.parts[0].ready.policy, display)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from mjx_reinforce.engine.base import Environment
 from mjx_reinforce.engine.memory import host_memory
+from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.registry import find_algorithm, is_own
 from mjx_reinforce.reports.experiment import counted
 from mjx_reinforce.runs.design import Design
@@ -73,6 +74,7 @@ class Prepared(NamedTuple):
     division: among which devices the runs are divided
     known: what the first file of its directory says, if it goes on
     found: the checkpoint from which a run goes on, if any
+    actors: with which a run begins, if those of another
     clock: counts the time since this was asked for
     """
 
@@ -81,6 +83,7 @@ class Prepared(NamedTuple):
     division: Division
     known: Mapping[str, Any]
     found: Checkpoint | None
+    actors: Actor | None
     clock: Stopwatch
 
     @property
@@ -110,16 +113,15 @@ def prepare(
     if design.resume is not None:
         resume.check_same_program(design.resume, known, provenance())
     if design.over:
-        return Prepared(design, *_prepare_sweep(design, known), known, None, clock)
-    config, division, found = design.base, divide_run(design.base), None
+        return Prepared(design, *_prepare_sweep(design, known), known, None, None, clock)
+    config, division, actors = design.base, divide_run(design.base), None
+    found = None if config.resume is None else _find(config, say)
     ready = get_ready(config, design.default or config, env, division)
-    if config.resume is not None:
-        found = _find(config, say)
     if config.init_from is not None and found is None:
-        last_actors(config, ready.policy)  # refused before anything is compiled
+        actors = last_actors(config, ready.policy)
     group, width = Group(config, np.zeros(1, int), {}), division.lanes(config.num_seeds)
     part = Part(group, ready, config.num_seeds, width, split_runs(group, "000", 1))
-    return Prepared(design, [part], division, known, found, clock)
+    return Prepared(design, [part], division, known, found, actors, clock)
 
 
 #: Episodes are divided among GPUs only where each plays so many of an update, of all seeds: fewer

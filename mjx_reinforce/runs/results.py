@@ -14,7 +14,7 @@ from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.engine.checks import check_kind
 from mjx_reinforce.export.policy_files import Player, build_policy
 from mjx_reinforce.export.run_files import Which
-from mjx_reinforce.files import read_arrays, read_json
+from mjx_reinforce.files import Arrays, read_arrays, read_json
 from mjx_reinforce.learning.policy import Actor, Policy
 from mjx_reinforce.runs.command_line import report_on
 from mjx_reinforce.runs.design import Design, check_swept
@@ -22,7 +22,6 @@ from mjx_reinforce.runs.perform import perform
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import worst_if_not_finite
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer
-from mjx_reinforce.training.record import Cells
 
 
 class Callbacks(Observer[Driver]):
@@ -32,7 +31,7 @@ class Callbacks(Observer[Driver]):
         """Takes the functions."""
         self._functions = functions
 
-    def evaluated(self, driver: Driver, evaluation: Evaluation, rows: Cells) -> None:
+    def evaluated(self, driver: Driver, evaluation: Evaluation, rows: Arrays) -> None:
         """Calls the functions."""
         for function in self._functions:
             if function(evaluation):

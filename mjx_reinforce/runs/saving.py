@@ -37,7 +37,7 @@ from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store.provenance import provenance
 from mjx_reinforce.training import resume
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer, Seen, Training
-from mjx_reinforce.training.record import HEADER, Cells, lines
+from mjx_reinforce.training.record import HEADER, lines
 from mjx_reinforce.training.resume import Checkpoint
 
 #: Between checkpoints (s), where the user has not said how many updates.
@@ -65,8 +65,9 @@ class Files(Observer[Seen]):
         """
         self._directory, self._prepared, self._say = directory, prepared, say
         self.contents = dict(prepared.known)
-        #: What could not be written when it was last tried.
+        #: What could not be written when it was last tried, and what is said of it.
         self._failing: set[str] = set()
+        self._hope = "; training goes on and tries again"
         #: Whether the newest checkpoint is of the present state; when it was tried, and of which.
         self._saved, self._at, self._updates = False, time.perf_counter(), 0
 
@@ -88,7 +89,8 @@ class Files(Observer[Seen]):
             self._save(driver)
 
     def ended(self, driver: Seen) -> None:
-        """Saves the last state, unless it is saved."""
+        """Saves the last state, unless it is saved; nobody tries again."""
+        self._hope, self._failing = "", set()
         if not self._saved:
             self._save(driver)
 
@@ -120,9 +122,7 @@ class Files(Observer[Seen]):
         except OSError as error:
             if what not in self._failing:
                 problem = error.strerror or error
-                self._say(
-                    f"warning: cannot write {what} ({problem}); training goes on and tries again"
-                )
+                self._say(f"warning: cannot write {what} ({problem}){self._hope}")
             self._failing.add(what)
             return False
         self._failing.discard(what)
@@ -192,7 +192,7 @@ class RunFiles(Files[Driver]):
         else:
             files.cut(self._metrics, found.metrics_bytes)
 
-    def evaluated(self, driver: Driver, evaluation: Evaluation, rows: Cells) -> None:
+    def evaluated(self, driver: Driver, evaluation: Evaluation, rows: Arrays) -> None:
         """Writes the rows of an evaluation."""
         self._waiting += lines(rows)
         self._attempt("metrics.csv", self._write_rows)

@@ -20,10 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.files import append, read_json, write_json
+from mjx_reinforce.files import Arrays, append, read_json, write_json
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import iqm, iqm_interval
-from mjx_reinforce.training.record import Cells
 
 #: The package that each needs.
 _NEEDED = {"tensorboard": "tensorboardX", "wandb": "wandb"}
@@ -48,19 +47,18 @@ MAX_SINGLE_SEEDS = 16
 _PROGRESS = ("env_steps", "episodes", "wall_seconds")
 
 
-def chart_step(rows: Cells) -> int:
+def chart_step(rows: Arrays) -> int:
     """Returns the place of an evaluation on the axis of charts: the most updates of a seed."""
-    return max(map(int, rows["update"]))
+    return int(rows["update"].max())
 
 
-def measured(rows: Cells) -> dict[str, np.ndarray]:
-    """Returns the columns [S] of one evaluation that were measured."""
+def measured(rows: Arrays) -> Arrays:
+    """Returns the columns [S] of one evaluation that say nothing of when it was."""
     apart = ("seed", "update", *_PROGRESS)
-    names = [name for name, cells in rows.items() if name not in apart and cells[0]]
-    return {name: np.array(rows[name], float) for name in names}
+    return {name: values.astype(float) for name, values in rows.items() if name not in apart}
 
 
-def scalars(rows: Cells) -> dict[str, float]:
+def scalars(rows: Arrays) -> dict[str, float]:
     """Returns the numbers that are shown, by name, such as ``eval_return/iqm``.
 
     For each column: ``iqm``, ``lowest`` (of returns, the worst seed), ``highest``, and ``seed_0``
@@ -70,7 +68,7 @@ def scalars(rows: Cells) -> dict[str, float]:
     Args:
       rows: of one evaluation.
     """
-    shown = {f"progress/{name}": float(np.array(rows[name], float).mean()) for name in _PROGRESS}
+    shown = {f"progress/{name}": float(rows[name].mean()) for name in _PROGRESS}
     for name, values in measured(rows).items():
         ends = {"lowest": values.min(), "highest": np.fmax.reduce(values), "iqm": iqm(values)}
         if name == "eval_return":  # of thousands of resamples
@@ -104,7 +102,7 @@ class TensorBoard:
         self._add(file_version="brain.Event:2")
         self._add(step=0 if updates is None else updates + 1, session_log={"status": "START"})
 
-    def write(self, rows: Cells) -> None:
+    def write(self, rows: Arrays) -> None:
         """Adds an event, or raises OSError and adds none."""
         # Not by ``summary.scalar``, which prints a line for every NaN.
         shown = [{"tag": name, "simple_value": x} for name, x in scalars(rows).items()]
@@ -156,7 +154,7 @@ class WeightsAndBiases:
                 settings=wandb.Settings(silent=True, console="off", x_disable_stats=True),
             )
 
-    def write(self, rows: Cells) -> None:
+    def write(self, rows: Arrays) -> None:
         """Logs the rows of one evaluation, or raises OSError."""
         with _errors_as_os_errors():
             self._run.log(scalars(rows), step=chart_step(rows))

@@ -2,9 +2,23 @@
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import optax
+
+from mjx_reinforce.engine.base import Discrete, Environment, action_space, observation_size
 from mjx_reinforce.engine.checks import check_kind, explain
+from mjx_reinforce.engine.contract import check_environment
+from mjx_reinforce.engine.devices import Devices
+from mjx_reinforce.export.policy_files import build_policy
+from mjx_reinforce.learning import estimators, schedules
+from mjx_reinforce.learning.contract import check_horizon
+from mjx_reinforce.learning.estimators import Estimator
+from mjx_reinforce.learning.learner import Learner, reinforce
+from mjx_reinforce.learning.natural_gradient import natural_gradient
+from mjx_reinforce.learning.policy import MLP, Policy
+from mjx_reinforce.learning.updates import Update, full_batch, make_optimizer
+from mjx_reinforce.learning.value import value_baseline
 from mjx_reinforce.registry import (
     ALGORITHMS,
     ESTIMATORS,
@@ -14,24 +28,15 @@ from mjx_reinforce.registry import (
     load_definition,
 )
 from mjx_reinforce.settings.config import Config
-
-if TYPE_CHECKING:
-    import optax
-
-    from mjx_reinforce.engine.base import Environment
-    from mjx_reinforce.engine.devices import Devices
-    from mjx_reinforce.learning.estimators import Estimator
-    from mjx_reinforce.learning.learner import Learner
-    from mjx_reinforce.learning.policy import Policy
-    from mjx_reinforce.learning.updates import Update
+from mjx_reinforce.training import wrappers
 
 
 def build(
-    env: "Environment",
+    env: Environment,
     config: Config,
-    policy: "Policy | None" = None,
-    devices: "Devices | None" = None,
-) -> "tuple[Learner, int]":
+    policy: Policy | None = None,
+    devices: Devices | None = None,
+) -> tuple[Learner, int]:
     """Builds the learner that the settings describe.
 
     Args:
@@ -46,10 +51,6 @@ def build(
     Raises:
       ValueError: the settings do not fit the environment.
     """
-    from mjx_reinforce.engine.contract import check_environment
-    from mjx_reinforce.export.policy_files import build_policy
-    from mjx_reinforce.learning.contract import check_horizon
-
     check_environment(env)
     horizon = check_horizon(env, config.horizon)
     forever = config.normalize_steps is None
@@ -69,10 +70,8 @@ def build(
     return learner, horizon
 
 
-def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:
+def policy_settings(env: Environment, config: Config) -> dict[str, Any]:
     """Returns what ``policy_files.build_policy`` needs to build the policy without the env."""
-    from mjx_reinforce.engine.base import Discrete, action_space, observation_size
-
     space, algorithm = action_space(env), find_algorithm(config.algorithm)
     if isinstance(space, Discrete):
         family, described = "categorical", {"num_actions": space.num_actions}
@@ -92,10 +91,8 @@ def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:
     }
 
 
-def build_reinforce(env: "Environment", config: Config, **shared: Any) -> "Learner":
+def build_reinforce(env: Environment, config: Config, **shared: Any) -> Learner:
     """Returns the learner of ``--algorithm reinforce``; arguments are those of a program."""
-    from mjx_reinforce.learning.learner import reinforce
-
     return reinforce(
         env,
         estimator=_build_estimator(config, shared["horizon"]),
@@ -109,29 +106,24 @@ def build_reinforce(env: "Environment", config: Config, **shared: Any) -> "Learn
 
 
 def _for_many_seeds(
-    learner: "Learner", config: Config, horizon: int, devices: "Devices | None"
-) -> "Learner":
+    learner: Learner, config: Config, horizon: int, devices: Devices | None
+) -> Learner:
     """Returns a learner with what many seeds need, see ``training.wrappers``."""
-    from mjx_reinforce.learning.schedules import Cut
-    from mjx_reinforce.training import wrappers
-
     cut_steps = 0
     if config.train_horizon is not None and config.whole_after < 1:
         cut_steps = config.train_horizon
-        learner = Cut(cut_steps, config.whole_after)(learner)
+        learner = schedules.Cut(cut_steps, config.whole_after)(learner)
     learner = wrappers.in_one_launch(learner, devices)
     return wrappers.short_episodes(learner, horizon, config.num_seeds, cut_steps)
 
 
-def _build_own(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
+def _build_own(env: Environment, config: Config, shared: dict[str, Any]) -> Learner:
     """Returns the learner of the user's own algorithm, a function of ``env``, ``config`` and these.
 
     ``shared`` are the keywords that ``reinforce`` and ``ars`` have in common.
     """
-    from mjx_reinforce.training.wrappers import check_learner
-
     learner = _made_by_user("algorithm", config.algorithm, ALGORITHMS, env, config, **shared)
-    check_learner(config.algorithm, learner)
+    wrappers.check_learner(config.algorithm, learner)
     return learner
 
 
@@ -146,9 +138,7 @@ def _made_by_user(
         raise ValueError(f"cannot build the {kind} {name!r}: {explain(error)}") from error
 
 
-def _build_estimator(config: Config, horizon: int) -> "Estimator":
-    from mjx_reinforce.learning import estimators
-
+def _build_estimator(config: Config, horizon: int) -> Estimator:
     if config.estimator == "value-baseline":
         estimator = _build_value_baseline(config, horizon)
     elif is_own(config.estimator):
@@ -162,11 +152,7 @@ def _build_estimator(config: Config, horizon: int) -> "Estimator":
     return estimators.standardize(estimator, floor=config.standardize_floor)
 
 
-def _build_value_baseline(config: Config, horizon: int) -> "Estimator":
-    import optax
-
-    from mjx_reinforce.learning.policy import MLP
-    from mjx_reinforce.learning.value import value_baseline
+def _build_value_baseline(config: Config, horizon: int) -> Estimator:
 
     return value_baseline(
         config.discount,
@@ -178,11 +164,7 @@ def _build_value_baseline(config: Config, horizon: int) -> "Estimator":
     )
 
 
-def _build_optimizer(config: Config) -> "optax.GradientTransformation":
-    import optax
-
-    from mjx_reinforce.learning import schedules
-    from mjx_reinforce.learning.updates import make_optimizer
+def _build_optimizer(config: Config) -> optax.GradientTransformation:
 
     rate = config.learning_rate
     final = rate / 10 if config.final_learning_rate is None else config.final_learning_rate
@@ -202,10 +184,7 @@ def _build_optimizer(config: Config) -> "optax.GradientTransformation":
     return optax.chain(optimizer, schedules.shrink_std(ratio, length))
 
 
-def _build_update(config: Config, policy: "Policy") -> "Update":
-    from mjx_reinforce.learning.natural_gradient import natural_gradient
-    from mjx_reinforce.learning.updates import full_batch
-
+def _build_update(config: Config, policy: Policy) -> Update:
     if config.update == "full-batch":
         return full_batch()
     assert config.max_kl is not None  # checked

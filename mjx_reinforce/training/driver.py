@@ -11,9 +11,9 @@ from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import MAX_COUNT, Config
-from mjx_reinforce.training.record import Cells, Record, RunRecord
+from mjx_reinforce.training.record import Measured, Record, RunRecord
 from mjx_reinforce.training.resume import Checkpoint, decisive
-from mjx_reinforce.training.slots import Measured, Slots
+from mjx_reinforce.training.slots import Slots
 from mjx_reinforce.training.state import Best, StateRows, first_best, keep_best
 
 
@@ -67,7 +67,7 @@ class Observer(Generic[Seen]):
           met: [S] how many of the last block met numbers which are not finite, of each seed.
         """
 
-    def evaluated(self, driver: Seen, evaluation: Evaluation, rows: Cells) -> None:
+    def evaluated(self, driver: Seen, evaluation: Evaluation, rows: Arrays) -> None:
         """Called after each evaluation, with what it measured and its rows in metrics.csv."""
 
     def ended(self, driver: Seen) -> None:

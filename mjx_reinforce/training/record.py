@@ -7,7 +7,7 @@ past hope. Nothing here prints, writes a file, or reads a clock.
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,11 +15,19 @@ from mjx_reinforce.files import Arrays
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import iqm, summarize
 
-if TYPE_CHECKING:
-    from mjx_reinforce.training.slots import Measured
 
-#: The rows of one evaluation as text: column -> the cells of all seeds; columns as in ``COLUMNS``.
-Cells = Mapping[str, Sequence[str]]
+class Measured(NamedTuple):
+    """What an evaluation of runs measured, and the updates that followed it.
+
+    runs: [n] their numbers, the least first
+    metrics: [K, n] each, what ``block_of_updates`` measured in at most K updates; empty without any
+    looked: [n] each, what ``block.evaluate`` returns of the policies before; empty without any
+    """
+
+    runs: np.ndarray
+    metrics: Arrays
+    looked: Arrays
+
 
 COLUMNS = (
     *("seed", "update", "episodes", "env_steps", "wall_seconds"),
@@ -32,23 +40,24 @@ HEADER = (",".join(COLUMNS) + "\n").encode()
 _RENAMED = {"train_return": "episode_return", "train_length": "episode_length"}
 
 
-def as_cells(measured: Arrays, seconds: float) -> Cells:
-    """Returns the cells of all seeds.
+def as_rows(measured: Arrays, seconds: float) -> Arrays:
+    """Returns the rows of one evaluation in metrics.csv: column -> the values [S] of all seeds.
 
     Args:
-      measured: [S] each, by column, or as ``_RENAMED``. What was not measured is empty. A return is
-        NaN if one of its episodes was not finite.
+      measured: [S] each, by column, or as ``_RENAMED``. What was not measured is no column. A
+        return is NaN if one of its episodes was not finite.
       seconds: wall time since compilation ended.
     """
-    known = {name: measured.get(_RENAMED.get(name, name)) for name in COLUMNS}
-    empty = [""] * len(measured["seed"])
-    cells = {name: empty if x is None else _cells(x) for name, x in known.items()}
-    return cells | {"wall_seconds": [f"{seconds:.3f}"] * len(empty)}
+    clock = np.full(len(measured["seed"]), round(seconds, 3))
+    named = {column: measured.get(_RENAMED.get(column, column)) for column in COLUMNS}
+    return {n: x for n, x in named.items() if x is not None} | {"wall_seconds": clock}
 
 
-def lines(rows: Cells) -> bytes:
-    """Returns rows as metrics.csv has them."""
-    return "".join(",".join(row) + "\n" for row in zip(*rows.values(), strict=True)).encode()
+def lines(rows: Arrays) -> bytes:
+    """Returns rows as metrics.csv has them; cells of what was not measured are empty."""
+    empty = [""] * len(rows["seed"])
+    columns = (_cells(rows[name]) if name in rows else empty for name in COLUMNS)
+    return "".join(",".join(row) + "\n" for row in zip(*columns, strict=True)).encode()
 
 
 def _cells(values: np.ndarray) -> Sequence[str]:
@@ -61,8 +70,8 @@ def _cells(values: np.ndarray) -> Sequence[str]:
     return [f"{text}.0" if text.lstrip("-").isdigit() else text for text in texts]
 
 
-#: The time left is estimated from so many of the latest blocks: episodes change their length.
-BLOCKS = 10
+#: The time left is estimated from so many of the latest evaluations: episodes change their length.
+_LATEST = 11
 
 
 def used(config: Config, env_steps: np.ndarray, updates: np.ndarray) -> np.ndarray:
@@ -139,18 +148,6 @@ def broken_in_a_row(before: np.ndarray, metrics: Arrays) -> np.ndarray:
     return count
 
 
-def hopeless(in_a_row: np.ndarray, used: np.ndarray, block: int) -> bool:
-    """Returns whether every seed that still trains was broken throughout a block of updates.
-
-    Args:
-      in_a_row: [S] from ``broken_in_a_row``.
-      used: [S] the fraction of its budget that each seed has used.
-      block: updates in a block; fewer than five count as five.
-    """
-    training = used < 1.0
-    return bool(training.any() and np.all(in_a_row[training] >= max(block, _FEWEST)))
-
-
 def describe_nonfinite(met: np.ndarray, first_seed: int, updates: int) -> str:
     """Returns one line about ``nonfinite_updates`` of which at least one is not 0.
 
@@ -167,45 +164,10 @@ def describe_nonfinite(met: np.ndarray, first_seed: int, updates: int) -> str:
     )
 
 
-class GrowingTable:
-    """Named columns [rows, ...] that grow by blocks of rows."""
-
-    def __init__(self, columns: Arrays):
-        """Begins with columns, which may be without rows, or with none at all."""
-        self._blocks = [columns] if columns else []
-
-    def append(self, block: Arrays) -> None:
-        """Takes in rows: every column, [rows, ...] each."""
-        self._blocks.append(block)
-
-    def columns(self) -> Arrays:
-        """Returns all rows."""
-        if len(self._blocks) > 1:
-            self._blocks = [_joined(self._blocks)]
-        return dict(self._blocks[0]) if self._blocks else {}
-
-    def latest(self, count: int, *names: str) -> Arrays:
-        """Returns the last ``count`` rows, of blocks none of which is empty, or all there are.
-
-        Args:
-          count: how many rows.
-          names: of the columns; all if none is named.
-        """
-        if not self._blocks:
-            return {}
-        tails = [{name: b[name][-count:] for name in names or b} for b in self._blocks[-count:]]
-        return {name: x[-count:] for name, x in _joined(tails).items()}
-
-
-def _joined(blocks: list[Arrays]) -> Arrays:
+def _joined(blocks: Sequence[Arrays]) -> Arrays:
     """Returns the rows of all blocks, in order."""
-    return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
-
-
-def _of_group(arrays: Mapping[str, np.ndarray], group: str) -> Arrays:
-    """Returns the arrays whose names begin with ``group`` and a dot, without these."""
-    start = f"{group}."
-    return {name.removeprefix(start): x for name, x in arrays.items() if name.startswith(start)}
+    names = blocks[0] if blocks else ()
+    return {name: np.concatenate([block[name] for block in blocks]) for name in names}
 
 
 class Record:
@@ -214,24 +176,28 @@ class Record:
     updates: [R] int64, how many each has made
     env_steps: [R] int64, how many each has played in training
     nonfinite: [R] int64, how many of its updates met numbers that are not finite
-    lengths: [R] int64, of a sweep, the steps of all episodes of each run's latest evaluation
+    returns: [R] of each run's latest evaluation
+    seen: [R] int64, the env steps at which that was; -1 before the first
+    lengths: [R] int64, of a sweep, the steps of all its episodes
     """
 
     #: What a checkpoint has besides the tables.
-    _kept: tuple[str, ...] = ("updates", "env_steps", "nonfinite", "lengths")
+    _kept: tuple[str, ...] = ("updates", "env_steps", "nonfinite", "returns", "seen", "lengths")
 
     def __init__(self, config: Config):
         """Begins before the first update; R is ``config.num_seeds``."""
-        self.config = config
-        counts = np.zeros((4, config.num_seeds), np.int64)
-        self.updates, self.env_steps, self.nonfinite, self.lengths = counts
-        self._tables = {"evaluations": GrowingTable({})}
+        self.config, self.returns = config, np.zeros(config.num_seeds, np.float32)
+        counts = np.zeros((5, config.num_seeds), np.int64)
+        self.updates, self.env_steps, self.nonfinite, self.lengths, self.seen = counts
+        self.seen -= 1
+        #: Name -> blocks of rows: named columns, [rows, ...] each.
+        self._tables: dict[str, list[Arrays]] = {"evaluations": []}
 
     def arrays(self) -> Arrays:
         """Returns all that was measured, by name, for ``restore``."""
         arrays = {name: np.array(getattr(self, name)) for name in self._kept}
-        for group, table in self._tables.items():
-            arrays |= {f"{group}.{name}": values for name, values in table.columns().items()}
+        for table in self._tables:
+            arrays |= {f"{table}.{name}": x for name, x in self._columns(table).items()}
         return arrays
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
@@ -243,21 +209,32 @@ class Record:
         for name in self._kept:
             value = arrays[name]
             setattr(self, name, value.copy() if value.ndim else value.item())
-        for group in self._tables:
-            self._tables[group] = GrowingTable(_of_group(arrays, group))
+        for table in self._tables:
+            start = f"{table}."
+            named = {n.removeprefix(start): x for n, x in arrays.items() if n.startswith(start)}
+            self._tables[table] = [named] if named else []
+
+    def _columns(self, table: str) -> Arrays:
+        """Returns all rows of a table."""
+        whole = _joined(self._tables[table])
+        self._tables[table] = [whole] if whole else []
+        return dict(whole)
 
     def begun(self) -> bool:
         """Returns whether there is an evaluation."""
-        return bool(self._tables["evaluations"].latest(1))
+        return bool(self._tables["evaluations"])
 
     def is_evaluated(self) -> bool:
         """Returns whether the present policies of all runs have been evaluated."""
-        last = self._tables["evaluations"].latest(1, "env_steps")
-        return bool(last) and np.array_equal(last["env_steps"][0], self.env_steps)
+        return np.array_equal(self.seen, self.env_steps)
 
     def used(self) -> np.ndarray:
         """Returns the fraction of its budget that each run has used."""
         return used(self.config, self.env_steps, self.updates)
+
+    def used_up(self) -> float:
+        """Returns how many whole budgets the runs have used together."""
+        return np.minimum(self.used(), 1.0).sum()
 
     def finished(self) -> bool:
         """Returns whether the budgets of all runs are used."""
@@ -271,7 +248,7 @@ class Record:
         """Returns whether no run is to go on, and the last policies are evaluated."""
         return self.over() and self.is_evaluated()
 
-    def add_evaluation(self, measured: "Measured", seconds: float) -> Cells:
+    def add_evaluation(self, measured: Measured, seconds: float) -> Arrays:
         """Takes in an evaluation of the present policies.
 
         Args:
@@ -279,24 +256,21 @@ class Record:
           seconds: wall time since compilation ended, at which the policies were there.
 
         Returns:
-          The cells of its rows in metrics.csv, which a sweep has not.
+          Its rows in metrics.csv, which a sweep has not.
         """
         runs, metrics, looked = measured
         made = np.any(metrics["active"], axis=0) if metrics else np.ones(len(runs), bool)
-        runs, returns = runs[made], np.zeros(len(self.updates), np.float32)
-        env_steps = np.zeros_like(self.env_steps)
-        if last := self._tables["evaluations"].latest(1):
-            returns, env_steps = last["eval_return"][0].copy(), last["env_steps"][0].copy()
-        returns[runs], env_steps[runs] = looked["eval_return"][made], self.env_steps[runs]
+        runs = runs[made]
+        self.returns[runs], self.seen[runs] = looked["eval_return"][made], self.env_steps[runs]
         self.lengths[runs] = looked["eval_steps"][made]
-        self._append(eval_return=returns, env_steps=env_steps)
+        self._append(eval_return=self.returns, env_steps=self.seen)
         return {}
 
     def _append(self, **row: np.ndarray) -> None:
         """Adds the row of an evaluation, such as [R]."""
         self._tables["evaluations"].append({name: x[None].copy() for name, x in row.items()})
 
-    def add_updates(self, measured: "Measured") -> np.ndarray:
+    def add_updates(self, measured: Measured) -> np.ndarray:
         """Takes in a block of updates; returns what ``nonfinite_updates`` does."""
         runs, metrics, _ = measured
         active, met = metrics["active"], nonfinite_updates(metrics)
@@ -319,15 +293,14 @@ class Record:
           gained: the part of the fraction from which the time left is estimated.
           passed: seconds in which that was gained.
         """
-        returns = self._tables["evaluations"].latest(1, "eval_return")["eval_return"][0]
         return Progress(
             fraction=fraction,
             updates=int(self.updates.max()),
             env_steps=float(self.env_steps.mean()),
-            iqm=float(iqm(returns)),
-            worst=float(returns.min()),
-            failed=int(np.sum(~np.isfinite(returns))),
-            num_seeds=len(returns),
+            iqm=float(iqm(self.returns)),
+            worst=float(self.returns.min()),
+            failed=int(np.sum(~np.isfinite(self.returns))),
+            num_seeds=len(self.returns),
             env_steps_per_second=float(self.env_steps.sum() / seconds) if seconds > 0 else math.nan,
             seconds_left=(1 - fraction) * passed / gained if gained > 0 else math.nan,
         )
@@ -337,7 +310,7 @@ class Record:
 
         That is ``eval_return``, the ``env_steps`` until then and, of a run, ``episodes``.
         """
-        past = self._tables["evaluations"].columns()
+        past = self._columns("evaluations")
         return {n: past[n] for n in ("eval_return", "env_steps", "episodes") if n in past}
 
 
@@ -365,23 +338,14 @@ class RunRecord(Record):
         self.simulated = self.evaluated = 0
         kinds = {"episode_return": np.float32, "env_steps": np.int64, "episodes": np.int64}
         first = {name: np.zeros((0, num_seeds), kind) for name, kind in kinds.items()}
-        self._tables["training"] = GrowingTable(first)
-        self._last: Arrays = {}
-
-    def arrays(self) -> Arrays:
-        """Returns all that was measured, by name, for ``restore``."""
-        return super().arrays() | {f"last.{name}": x for name, x in self._last.items()}
-
-    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Goes back to what a record of the same settings had measured."""
-        super().restore(arrays)
-        self._last = _of_group(arrays, "last")
+        #: "last" has one row, the metrics of each seed's last update.
+        self._tables |= {"training": [first], "last": []}
 
     def moved(self) -> tuple[None, None]:
         """Returns None for all: a seed whose budget is used is still evaluated."""
         return None, None
 
-    def add_updates(self, measured: "Measured") -> np.ndarray:
+    def add_updates(self, measured: Measured) -> np.ndarray:
         """Takes in a block of updates.
 
         A training return is NaN if one of its episodes left the finite numbers.
@@ -412,12 +376,12 @@ class RunRecord(Record):
     def _remember(self, metrics: Arrays) -> None:
         """Keeps each seed's metrics of its last update; a seed that stands still makes none."""
         made = metrics["active"].sum(axis=0)
-        last = np.maximum(made - 1, 0)
-        for name, values in metrics.items():
-            newest = np.take_along_axis(values, last[None], axis=0)[0]
-            self._last[name] = np.asarray(np.where(made > 0, newest, self._last.get(name, newest)))
+        last = np.maximum(made - 1, 0)[None]
+        newest = {name: np.take_along_axis(x, last, axis=0) for name, x in metrics.items()}
+        old = self._columns("last") or newest
+        self._tables["last"] = [{n: np.where(made > 0, x, old[n]) for n, x in newest.items()}]
 
-    def add_evaluation(self, measured: "Measured", seconds: float) -> Cells:
+    def add_evaluation(self, measured: Measured, seconds: float) -> Arrays:
         """Takes in an evaluation [S] of the present policies of all seeds.
 
         Args:
@@ -425,18 +389,22 @@ class RunRecord(Record):
           seconds: wall time since compilation ended.
 
         Returns:
-          The cells of its rows in metrics.csv.
+          Its rows in metrics.csv.
         """
         looked, seeds = measured.looked, self.config.first_seed + np.arange(len(self.updates))
         counts = {"env_steps": self.env_steps, "episodes": self.episodes}
         self._append(**looked, **counts, updates=self.updates, seconds=np.array(seconds))
         self.add_test(looked)
+        self.returns, self.seen = looked["eval_return"], self.env_steps.copy()
         counts |= {"seed": seeds, "update": self.updates}
-        return as_cells(self._last | looked | counts, seconds)
+        last = {name: x[0] for name, x in self._columns("last").items()}
+        return as_rows(last | looked | counts, seconds)
 
     def progress(self) -> Progress:
         """Returns how far the run is, right after an evaluation."""
-        past = self._tables["evaluations"].latest(BLOCKS + 1, "env_steps", "updates", "seconds")
+        names, rows = ("env_steps", "updates", "seconds"), self._tables["evaluations"][-_LATEST:]
+        latest = _joined([{name: block[name][-_LATEST:] for name in names} for block in rows])
+        past = {name: x[-_LATEST:] for name, x in latest.items()}
         counted = used(self.config, past["env_steps"], past["updates"])
         fractions = np.minimum(counted, 1.0).mean(axis=-1).tolist()
         now, seconds = fractions[-1], past["seconds"].tolist()
@@ -453,14 +421,15 @@ class RunRecord(Record):
 
     def hopeless(self) -> bool:
         """Returns whether all seeds that still train were broken throughout a block of updates."""
-        return hopeless(self.broken_in_a_row, self.used(), self.config.eval_every)
+        training, block = self.used() < 1.0, max(self.config.eval_every, _FEWEST)
+        return bool(training.any() and np.all(self.broken_in_a_row[training] >= block))
 
     def training(self) -> Arrays:
         """Returns ``episode_return`` and the ``env_steps`` and ``episodes`` after it, [U, S].
 
         A return is NaN where the seed stood still or an episode left the finite numbers.
         """
-        return self._tables["training"].columns()
+        return self._columns("training")
 
     def summary(self, engine: str, compile_seconds: float, run_seconds: float) -> dict[str, Any]:
         """Returns what summary.json says.

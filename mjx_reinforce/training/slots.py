@@ -28,6 +28,7 @@ from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import num_cores
 from mjx_reinforce.training.programs import Programs
+from mjx_reinforce.training.record import Measured
 from mjx_reinforce.training.state import Budget, RunState, StateRows, budget_of, shape_of_all
 
 
@@ -66,10 +67,10 @@ class Stopwatch:
         """Returns the rest of the time: training and evaluating."""
         return time.perf_counter() - self.began - self.compiling
 
-    def wait(self, compiled: Future) -> Any:
-        """Returns a program, once it is compiled."""
+    def wait(self, compile: Callable[[], Any]) -> Any:
+        """Returns a program, compiled here or elsewhere."""
         began = time.perf_counter()
-        program = compiled.result()
+        program = compile()
         self.compiling += time.perf_counter() - began
         return program
 
@@ -80,19 +81,6 @@ def started(task: Callable[[], Any]) -> Future:
     Python waits for it before it exits: a compiler that is cut off there ends the process.
     """
     return ThreadPoolExecutor(1).submit(task)
-
-
-class Measured(NamedTuple):
-    """What an evaluation of runs measured, and the updates that followed it.
-
-    runs: [n] their numbers, the least first
-    metrics: [K, n] each, what ``block_of_updates`` measured in at most K updates; empty without any
-    looked: [n] each, what ``block.evaluate`` returns of the policies before; empty without any
-    """
-
-    runs: np.ndarray
-    metrics: Arrays
-    looked: Arrays
 
 
 class Slot(NamedTuple):

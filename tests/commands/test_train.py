@@ -137,11 +137,13 @@ FULL = [
 def failing(run, monkeypatch):
     """Runs a command line whose training raises an error: its exit code."""
 
-    def fail(error):
-        def conduct(*_):
+    def fail(error, place="conduct.conduct"):
+        def called(*given):
+            for interrupt in given[-1:]:
+                interrupt.defer(print)
             raise error
 
-        monkeypatch.setattr("mjx_reinforce.runs.conduct.Conductor.conduct", conduct)
+        monkeypatch.setattr(f"mjx_reinforce.runs.{place}", called)
         return run(*ARGUMENTS, "--output", "out")
 
     return fail
@@ -157,6 +159,11 @@ def test_what_is_full_is_said_in_one_line(failing, tmp_path, capsys, error, stat
 def test_a_mistake_of_ours_in_training_is_no_bad_input(failing):
     with pytest.raises(ValueError, match="a bug"):
         failing(ValueError("a bug"))
+
+
+def test_libraries_that_find_no_memory_do_not_ask_for_fewer_seeds(failing, capsys):
+    assert failing(MemoryError(), "perform.configure_jax") == 2
+    assert "cannot load what this package needs (no memory is left)" in capsys.readouterr().err
 
 
 def test_another_error_is_not_said_to_be_of_memory(failing):

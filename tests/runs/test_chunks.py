@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training.record import Record
-from mjx_reinforce.training.slots import Measured
+from mjx_reinforce.training.record import Measured, Record
 
 CONFIG = Config(num_seeds=4, env_steps=100, max_updates=10)
 
@@ -59,14 +58,3 @@ def test_progress_is_what_the_runs_have_made_and_last_returned():
     now = record.measure(0.5, seconds=2.5, gained=0.25, passed=3.0)
     assert record.used().tolist() == pytest.approx([0, 0.6, 0, 1.3])
     assert now == (0.5, 4, 190 / 4, now.iqm, 1, 0, 4, 190 / 2.5, 6)
-
-
-def test_a_record_is_restored():
-    record, copy = filled(), Record(CONFIG)
-    assert not copy.is_evaluated()
-    copy.restore({name: x.copy() for name, x in record.arrays().items()})
-    for each in (record, copy):
-        add(each, measured([0], [5], [3], [[1]], [[99]], [[0]]), 3.0)
-    one, other = record.arrays(), copy.arrays()
-    assert one.keys() == other.keys()
-    assert all(np.array_equal(one[name], other[name]) for name in one)

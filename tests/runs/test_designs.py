@@ -49,6 +49,7 @@ def test_words_become_values_of_the_type_of_their_setting():
         ([["discount", "0.9"], ["discount", "0.8"]], "given twice"),
         ([["num-episodes", "4.5", "8"]], "'4.5', not a whole number"),
         ([["learning-rate", "0.1,0.2"]], "write spaces between values"),
+        ([["hidden-sizes", "8", "32,x"]], "value '32,x', not layers, such as 32,32, or none$"),
     ],
 )
 def test_words_that_are_no_values_are_refused(given, said):

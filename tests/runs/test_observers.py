@@ -115,11 +115,13 @@ def test_a_full_disk_is_a_warning_once_and_is_tried_again(watched):
         for what in ("a checkpoint", "summary.json")
     ]
     full.clear()
-    files.ended(run)
-    assert "checkpoint of 8" in written
-    full.add("checkpoint of 12")
     go_on(files, run, 12)
+    assert "checkpoint of 12" in written
+    full.add("checkpoint of 16")
+    go_on(files, run, 16)
     assert len(said) == 3
+    files.ended(run)  # after which nobody tries again
+    assert said[3] == "warning: cannot write a checkpoint (No space left on device)"
 
 
 def test_rows_go_to_the_table_and_to_each_sink(watched):
@@ -127,14 +129,15 @@ def test_rows_go_to_the_table_and_to_each_sink(watched):
     sunk = []
     files._sinks = [SimpleNamespace(name="tensorboard/", write=sunk.append, close=lambda: None)]
     full.add("metrics.csv")
-    files.evaluated(run, None, {"seed": ["0"]})
-    assert sunk == [{"seed": ["0"]}]
+    rows = {"seed": np.array([0])}
+    files.evaluated(run, None, rows)
+    assert sunk == [rows]
     assert said == [
         "warning: cannot write metrics.csv (No space left on device); training goes on and tries "
         "again"
     ]
     full.clear()
-    files.evaluated(run, None, {"seed": ["1"]})
+    files.evaluated(run, None, rows)
     assert written == ["metrics.csv"]
 
 

@@ -33,7 +33,7 @@ def evaluation(update, num_seeds=20, first=False):
     measured |= {} if first else dict.fromkeys(metrics, values) | dict.fromkeys(counts, updates)
     measured |= {"seed": np.arange(num_seeds), "update": updates}
     measured |= {"episodes": 4 * updates, "env_steps": 40 * updates}
-    return record.as_cells(measured, 0.1 * update)
+    return record.as_rows(measured, 0.1 * update)
 
 
 def begin(directory, config):

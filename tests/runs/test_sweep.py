@@ -394,16 +394,9 @@ def test_what_a_kill_left_of_a_report_goes(tmp_path, monkeypatch):
 
 
 def test_what_ended_earlier_repeats_its_last_row():
-    joined = join_parts(
-        [
-            {"configuration": np.array([1, 0]), "seed": np.array([0, 0]), "eval_return": np.eye(2)},
-            {
-                "configuration": np.array([0]),
-                "seed": np.array([1]),
-                "eval_return": np.full((3, 1), 7.0),
-            },
-        ]
-    )
+    one = {"configuration": np.array([1, 0]), "seed": np.array([0, 0]), "eval_return": np.eye(2)}
+    other = {"configuration": np.array([0]), "seed": np.array([1])}
+    joined = join_parts([one, other | {"eval_return": np.full((3, 1), 7.0)}])
     assert joined["configuration"].tolist() == [0, 0, 1]
     assert joined["seed"].tolist() == [0, 1, 0]
     assert joined["eval_return"].tolist() == [[0, 7, 1], [1, 7, 0], [1, 7, 0]]

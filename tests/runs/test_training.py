@@ -73,11 +73,9 @@ def test_minutes_become_env_steps_before_the_run_begins(ready, monkeypatch):
     assert driver.config.horizon == ready.horizon
 
 
-def test_a_run_begins_with_the_policies_of_another(ready, driver, monkeypatch):
+def test_a_run_begins_with_the_policies_of_another(ready, driver):
     learned = driver.states.train_states.actor
-    monkeypatch.setattr(conduct, "last_actors", lambda config, policy: learned)
-    again = dataclasses.replace(CONFIG, init_from="another run")
-    begun = begin(ready, again).states.train_states.actor
+    begun = begin(ready, CONFIG, actors=learned).states.train_states.actor
     mean = learned.normalizer.mean
     np.testing.assert_array_equal(begun.normalizer.mean, mean)
     assert mean.any()  # that of a fresh policy is 0

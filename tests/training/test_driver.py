@@ -7,8 +7,7 @@ import numpy as np
 from mjx_reinforce.learning import counts
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.driver import Driver, Runs
-from mjx_reinforce.training.record import RunRecord
-from mjx_reinforce.training.slots import Measured
+from mjx_reinforce.training.record import Measured, RunRecord
 from mjx_reinforce.training.state import Best, first_best, keep_best
 
 BLOCK = 2

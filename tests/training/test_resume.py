@@ -282,18 +282,27 @@ def test_two_processes_do_not_train_in_one_directory(run, parts, capsys):
     assert "another process trains in parts" in capsys.readouterr().err
 
 
-def test_the_folder_of_a_run_that_begins_elsewhere_stays(run, tmp_path, monkeypatch, capsys):
-    """Of two processes one makes the folder, and the other is quicker to train in it."""
+@pytest.mark.parametrize("said", ["another process trains in out/in", "out/in is not empty"])
+def test_a_folder_in_which_another_is_quicker_stays(run, tmp_path, monkeypatch, capsys, said):
+    """Of two processes one makes the folder; the other trains in it meanwhile, or has trained."""
     with contextlib.ExitStack() as other:
 
         def quicker(directory):
-            other.enter_context(locked(directory))
+            (directory / "config.json").touch()
+            if "another" in said:
+                other.enter_context(locked(directory))
             return locked(directory)
 
         monkeypatch.setattr("mjx_reinforce.runs.perform.locked", quicker)
         assert run("--output", "out/in") == 2
-    assert "another process trains in out/in" in capsys.readouterr().err
-    assert (tmp_path / "out" / "in").is_dir()
+    assert said in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "out/in").iterdir()] == ["config.json"]
+
+
+def test_a_link_in_a_circle_is_no_directory(run, tmp_path, capsys):
+    (tmp_path / "one").symlink_to("one")
+    assert run("--output", "one") == 2
+    assert "directory one (Too many levels of symbolic links)" in capsys.readouterr().err
 
 
 def test_a_finished_run_has_nothing_to_do(run, trained, tmp_path, capsys):

@@ -78,6 +78,6 @@ def test_keys_are_keys_again():
 
 def test_waiting_for_a_program_is_compiling():
     clock = Stopwatch()
-    assert clock.wait(started(lambda: time.sleep(0.2) or "program")) == "program"
+    assert clock.wait(started(lambda: time.sleep(0.2) or "program").result) == "program"
     assert clock.compiling > 0
     assert clock.running() < 0.1
