@@ -243,7 +243,7 @@ def _refuse_full(error: RuntimeError | MemoryError | OSError, design: Design) ->
     """Refuses what met a full memory or disk, as ``refuse``; raises any other error again."""
     if isinstance(error, OSError):
         what, again = "sweep" if design.over else "run", "try again"
-        if (design.directory / design.first_file).exists():
+        if any((design.directory / name).exists() for name in resume.BEGUN):
             again = f"go on with --resume {design.directory}{code_flags(vars(design.base))}"
         room = "make room, then" if error.errno else "then"  # W&B's have no number
         refuse(f"cannot write the files of this {what} ({error}); {room} {again}", status=1)

@@ -28,7 +28,7 @@ from mjx_reinforce.settings.config import (
     spoken,
 )
 from mjx_reinforce.settings.groups import LogSettings
-from mjx_reinforce.training.resume import PLACES, as_config, read_record
+from mjx_reinforce.training.resume import as_config, read_record, recordable
 
 #: What writing curves.npz and a report needs for a run with two evaluations (bytes).
 _RESULT = 760
@@ -71,22 +71,12 @@ class Design:
         """The settings that the user chose."""
         return () if self.default is None else changed(self.base, self.default)
 
-    @property
-    def resume(self) -> Path | None:
-        """The directory in which it goes on, if it does."""
-        return self.base.resume
-
     @functools.cached_property
     def directory(self) -> Path:
         """Where its files are; ``runs/<env>-<time>`` if nobody said."""
         stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S-%f")[:-3]
         named = Path("runs") / f"{self.base.env.replace(':', '.')}-{stamp}"
-        return self.resume or self.base.output or named
-
-    @property
-    def first_file(self) -> str:
-        """The name of the file with which its directory begins."""
-        return "sweep.json" if self.over else "config.json"
+        return self.base.resume or self.base.output or named
 
     def count(self) -> int:
         """Returns how many configurations it has."""
@@ -106,11 +96,8 @@ class Design:
 
 def as_record(design: Design) -> dict[str, Any]:
     """Returns what sweep.json says of a design: all that decides its numbers."""
-    settings = dataclasses.asdict(design.base)
-    for name in PLACES:
-        del settings[name]
     over = {name: list(values) for name, values in design.over.items()}
-    return {"settings": settings, "over": over, "exact": design.exact}
+    return {"settings": recordable(design.base), "over": over, "exact": design.exact}
 
 
 def read_design(directory: Path) -> Design:

@@ -176,7 +176,7 @@ def perform(
     """
     check_design(design)
     with contextlib.ExitStack() as held:
-        directory, resumed = design.directory if files else None, design.resume is not None
+        directory, resumed = design.directory if files else None, design.base.resume is not None
         if directory is not None:
             held.enter_context(own_directory(directory, interrupt, resumed=resumed))
         known = read_record(design.directory) if resumed else {}

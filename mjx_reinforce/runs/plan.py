@@ -110,8 +110,8 @@ def prepare(
       ValueError: settings do not fit the environment, or it cannot go on here.
     """
     clock = Stopwatch()
-    if design.resume is not None:
-        resume.check_same_program(design.resume, known, provenance())
+    if design.base.resume is not None:
+        resume.check_same_program(design.directory, known, provenance())
     if design.over:
         return Prepared(design, *_prepare_sweep(design, known), known, None, None, clock)
     config, division, actors = design.base, divide_run(design.base), None
@@ -175,7 +175,7 @@ def _prepare_sweep(design: Design, known: Mapping[str, Any]) -> tuple[list[Part]
     old = known.get("local_devices", division.count)
     if old != division.count:
         raise ValueError(
-            f"{design.resume} was begun on {old} devices, and here are {division.count}; go on "
+            f"{design.directory} was begun on {old} devices, and here are {division.count}; go on "
             "with as many"
         )
     parts = []

@@ -153,12 +153,11 @@ class RunFiles(Files[Driver]):
           OSError: a file cannot be written.
         """
         found, reached = self._prepared.found, None
+        self._go_on(driver, found)
         if driver.config.resume is None:
             self._write_first(driver.config)
         else:
-            self._take_back(driver.config, found)
-        self._go_on(driver, found)
-        if driver.config.resume is not None:
+            self._take_back(driver, found)
             reached = None if found is None else driver.updates()
             again = "" if reached else ": there is no checkpoint yet, so it begins again"
             self._say(f"going on after {reached or 0} updates{again}")
@@ -171,7 +170,7 @@ class RunFiles(Files[Driver]):
         self._write_json("config.json", settings | provenance())
         write_bytes(self._metrics, HEADER)
 
-    def _take_back(self, config: Config, found: Checkpoint | None) -> None:
+    def _take_back(self, driver: Driver, found: Checkpoint | None) -> None:
         """Takes the files back to a checkpoint, and says in config.json that the run goes on.
 
         A crash in between leaves a run that can be resumed: config.json is first, so that the
@@ -179,10 +178,10 @@ class RunFiles(Files[Driver]):
         """
         moment = {
             "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-            "updates": 0 if found is None else int(found.record["updates"].max()),
-            "env_steps": 0 if found is None else int(found.record["env_steps"].sum()),
+            "updates": driver.updates(),
+            "env_steps": int(driver.record.env_steps.sum()),
         }
-        budgets = {name: getattr(config, name) for name in resume.BUDGETS}
+        budgets = {name: getattr(driver.config, name) for name in resume.BUDGETS}
         resumed = [*self.contents.get("resumed", []), moment]
         self._write_json("config.json", self.contents | budgets | {"resumed": resumed})
         self._write_json("summary.json", {"status": "running", **moment})

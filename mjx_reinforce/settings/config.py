@@ -118,7 +118,10 @@ def marked(mark: enum.Enum) -> tuple[str, ...]:
 def check(config: Config) -> None:
     """Raises ValueError for settings that make no sense: what, the value, the remedy."""
     check_each(config)
-    check_together(config)
+    if config.env_steps is None and config.max_updates is None:
+        raise ValueError("nothing would end this run: give --env-steps or --max-updates a number")
+    if config.algorithm == "reinforce":
+        _check_reinforce(config)
 
 
 def check_each(config: Config) -> None:
@@ -140,14 +143,6 @@ def check_each(config: Config) -> None:
             value = getattr(config, name)
             if not (value is None or isinstance(value, str) or rule.holds(value)):
                 raise ValueError(f"{flag(name)} must be {rule.said}, got {reprlib.repr(value)}")
-
-
-def check_together(config: Config) -> None:
-    """Raises ValueError for settings that do not go together."""
-    if config.env_steps is None and config.max_updates is None:
-        raise ValueError("nothing would end this run: give --env-steps or --max-updates a number")
-    if config.algorithm == "reinforce":
-        _check_reinforce(config)
 
 
 def flag(name: str) -> str:

@@ -134,15 +134,13 @@ def num_cores() -> int:
 
 
 def has_gpu() -> bool:
-    """Returns whether JAX is likely to find an NVIDIA GPU; JAX is not imported."""
-    return may_have_accelerator() and any(Path("/dev").glob("nvidia[0-9]*"))
+    """Returns whether JAX is likely to find an NVIDIA GPU; JAX is not imported.
 
-
-def may_have_accelerator() -> bool:
-    """Returns whether JAX may find a GPU: without a plugin it has the CPU alone."""
-    if os.environ.get("JAX_PLATFORMS") == "cpu":
+    Without a plugin it has the CPU alone.
+    """
+    if os.environ.get("JAX_PLATFORMS") == "cpu" or not importlib.util.find_spec("jax_plugins"):
         return False
-    return importlib.util.find_spec("jax_plugins") is not None
+    return any(Path("/dev").glob("nvidia[0-9]*"))
 
 
 def named_code(arguments: Sequence[str]) -> dict[str, str | None]:

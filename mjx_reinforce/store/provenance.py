@@ -49,11 +49,6 @@ def _git_commit() -> str | None:
     folders = [str(here.parent), str((here.parent / "envs").resolve())]
     command = ["git", "-C", str(here), "log", "-1", "--format=%H", "--", *folders]
     with contextlib.suppress(OSError, subprocess.CalledProcessError):
-        tracked = subprocess.run(
-            ["git", "-C", str(here), "ls-files", "--error-unmatch", Path(__file__).name],
-            capture_output=True,
-        )
-        if tracked.returncode == 0:
-            done = subprocess.run(command, capture_output=True, check=True, text=True)
-            return done.stdout.strip()
+        done = subprocess.run(command, capture_output=True, check=True, text=True)
+        return done.stdout.strip() or None
     return None

@@ -268,7 +268,7 @@ def rebuild(described: Any) -> Any:
         return None
     if "leaf" in described:
         kind = described["leaf"]
-        dtype = _key_dtype() if kind == "key" else np.dtype(kind)
+        dtype = jax.eval_shape(jax.random.key, 0).dtype if kind == "key" else np.dtype(kind)
         return jax.ShapeDtypeStruct(tuple(described["shape"]), dtype)
     if "class" in described:
         module, _, name = described["class"].partition(":")
@@ -287,7 +287,3 @@ def _fields(tree: PyTree) -> tuple[str, ...] | None:
     if dataclasses.is_dataclass(tree):
         return tuple(field.name for field in dataclasses.fields(tree))
     return getattr(tree, "_fields", None)
-
-
-def _key_dtype() -> Any:
-    return jax.eval_shape(jax.random.key, 0).dtype

@@ -40,7 +40,7 @@ _OTHER = "damaged, or of another version of the program; resume with the version
 
 
 #: The first file of a run, and that of a sweep.
-_BEGUN = ("config.json", "sweep.json")
+BEGUN = ("config.json", "sweep.json")
 
 
 def read_record(directory: Path) -> dict[str, Any]:
@@ -49,14 +49,14 @@ def read_record(directory: Path) -> dict[str, Any]:
     Raises:
       ValueError: it is not there, or it is damaged.
     """
-    for name in _BEGUN:
+    for name in BEGUN:
         try:
             return read_json(directory / name)
         except ValueError as error:
             if not isinstance(error.__cause__, FileNotFoundError):
                 raise
     raise ValueError(
-        f"cannot resume {directory}: there is no {' or '.join(_BEGUN)}, so nothing was begun "
+        f"cannot resume {directory}: there is no {' or '.join(BEGUN)}, so nothing was begun "
         "there; start it anew with --output"
     )
 

@@ -83,31 +83,22 @@ def started(task: Callable[[], Any]) -> Future:
     return ThreadPoolExecutor(1).submit(task)
 
 
-class Slot(NamedTuple):
-    """The compiled programs of one slot. States are rows of bytes, see ``StateRows``.
-
-    advance: (states [W, B], budget, which lanes have a run [W], whether to evaluate []) -> (states
-      [W, B], metrics [K, W] each, what was evaluated [W] each, if that rides), as in ``Measured``
-    evaluate: (states [W, B], which [W]) -> what ``block.evaluate`` returns [W] each
-    """
-
-    advance: jax.stages.Compiled
-    evaluate: jax.stages.Compiled
-
-
 class Compiled(NamedTuple):
-    """Programs that are compiled for slots.
+    """Programs that are compiled for slots of W runs. States are rows of bytes, see ``StateRows``.
 
     begin: (seed, the numbers [W] of the runs' seeds, settings [W] each) -> the first states [W, B],
       and the data of the keys [K, W] of the last test
-    slot: what moves the runs of a slot
+    advance: (states [W, B], budget, which lanes have a run [W], whether to evaluate []) -> (states
+      [W, B], metrics [K, W] each, what was evaluated [W] each, if that rides), as in ``Measured``
+    evaluate: (states [W, B], which [W]) -> what ``block.evaluate`` returns [W] each
     width: W, the runs of a slot
     programs: that were compiled
     config: the settings of the runs; one of those that differ stands for any value
     """
 
     begin: Callable[..., tuple[jax.Array, jax.Array]]
-    slot: Slot
+    advance: jax.stages.Compiled
+    evaluate: jax.stages.Compiled
     width: int
     programs: Programs
     config: Config
@@ -183,7 +174,7 @@ class Slots:
         Returns:
           What was measured in each block in which a run made an update.
         """
-        lanes, programs = self._pack(chosen, lengths), self._compiled.slot
+        lanes, programs = self._pack(chosen, lengths), self._compiled
         count = most if len(lanes) == 1 else 1
         budget = self._division.put(tuple(self.budget), NONE)
 
@@ -212,7 +203,7 @@ class Slots:
 
     def evaluate(self) -> Measured:
         """Evaluates the present policies of all runs."""
-        lanes, programs = self._pack(), self._compiled.slot
+        lanes, programs = self._pack(), self._compiled
 
         def look(runs: np.ndarray) -> Any:
             which = self._division.put(runs >= 0)
@@ -290,9 +281,23 @@ def compile_slots(programs: Programs, config: Config, width: int) -> Compiled:
     Raises:
       ValueError: a slot does not fit into memory.
     """
-    begin = started(functools.partial(_compile_begin, programs, width))
-    slot = _compile_slot(programs, StateRows(programs.like), width)
-    return Compiled(begin.result(), slot, width, programs, config)
+    division, layout = programs.division, StateRows(programs.like)
+    check_room(2.0 * width * layout.size)
+    beginning = started(functools.partial(_compile_begin, programs, width))
+    rows, which = division.put((np.zeros((width, layout.size), np.uint8), np.zeros(width, bool)))
+    nothing, no_look = division.put((tuple(Budget.of(0, 0)), np.bool_(False)), NONE)
+    given = rows, nothing, which, no_look
+    specs = (RUNS, NONE, RUNS, NONE), (RUNS, SECOND, RUNS)
+    looking = division.jit(programs.evaluate, (RUNS, RUNS), RUNS).lower(rows, which)
+    evaluating = started(functools.partial(executable, looking))
+    updating = division.jit(programs.advance, *specs, by_episodes=True).lower(*given)
+    advancing = started(functools.partial(executable, updating))
+    advance, evaluate = advancing.result(), evaluating.result()
+    check_fits(advance)
+    check_fits(evaluate)
+    # No run: a GPU's driver translates the kernels of a program when it first runs.
+    jax.block_until_ready(advance(*given))
+    return Compiled(beginning.result(), advance, evaluate, width, programs, config)
 
 
 def compile_run(programs: Programs, config: Config) -> Slots:
@@ -309,26 +314,6 @@ def _compile_begin(programs: Programs, width: int) -> Callable[..., Any]:
     given = division.shapes((numbers, shape_of_all(programs.like, width).settings), RUNS)
     program = division.jit(programs.begin, (NONE, RUNS, RUNS), (RUNS, SECOND))
     return executable(program.lower(seed, *given))
-
-
-def _compile_slot(programs: Programs, layout: StateRows, width: int) -> Slot:
-    """Compiles what moves slots of ``width`` runs."""
-    division = programs.division
-    check_room(2.0 * width * layout.size)
-    rows, which = division.put((np.zeros((width, layout.size), np.uint8), np.zeros(width, bool)))
-    nothing, no_look = division.put((tuple(Budget.of(0, 0)), np.bool_(False)), NONE)
-    given = rows, nothing, which, no_look
-    specs = (RUNS, NONE, RUNS, NONE), (RUNS, SECOND, RUNS)
-    looking = division.jit(programs.evaluate, (RUNS, RUNS), RUNS).lower(rows, which)
-    evaluating = started(functools.partial(executable, looking))
-    updating = division.jit(programs.advance, *specs, by_episodes=True).lower(*given)
-    advancing = started(functools.partial(executable, updating))
-    slot = Slot(advancing.result(), evaluating.result())
-    check_fits(slot.advance)
-    check_fits(slot.evaluate)
-    # No run: a GPU's driver translates the kernels of a program when it first runs.
-    jax.block_until_ready(slot.advance(*given))
-    return slot
 
 
 def memory_here() -> float:

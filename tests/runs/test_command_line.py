@@ -14,7 +14,7 @@ def test_flags_make_a_design():
     design = command_line.parse([*FLAGS, "--exact", "--chunk-runs", "4"], "sweep")
     assert list(design.over["learning_rate"]) == [0.1, 0.2]
     assert (design.base.env, design.base.discount) == ("CartPole-v1", 0.5)
-    assert (design.exact, design.chunk_runs, design.resume) == (True, 4, None)
+    assert (design.exact, design.chunk_runs, design.base.resume) == (True, 4, None)
     assert set(design.given) == {"discount"}
 
 

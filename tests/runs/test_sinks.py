@@ -38,7 +38,8 @@ def evaluation(update, num_seeds=20, first=False):
 
 def begin(directory, config):
     """Begins a run in a directory, or goes on without a checkpoint."""
-    run = SimpleNamespace(config=config, updates=lambda: 0)
+    record = SimpleNamespace(env_steps=np.zeros(1))
+    run = SimpleNamespace(config=config, updates=lambda: 0, record=record)
     part = SimpleNamespace(ready=SimpleNamespace(policy={}))
     prepared = SimpleNamespace(known={}, found=None, parts=[part])
     files = RunFiles(directory, prepared, lambda text: None)
