@@ -116,10 +116,8 @@ def test_a_record_of_two_seeds_by_hand():
     assert met.tolist() == [1, 0]
     second = record.add_evaluation(looked(7, 10), 2.00009)
     keys = ("seed", "update", "episodes", "env_steps", "wall_seconds", "train_return")
-    assert measured.lines({key: second[key] for key in keys}).decode().split() == [
-        "0,2,4,70,2.0,nan" + 13 * ",",
-        "1,1,2,40,2.0,4.0" + 13 * ",",
-    ]
+    rows = measured.lines({key: second[key] for key in keys}).decode().split()
+    assert [row.rstrip(",") for row in rows] == ["0,2,4,70,2.0,nan", "1,1,2,40,2.0,4.0"]
     assert second["skipped_update"].tolist() == [1, 0]
     progress = record.progress()
     assert progress[:-2] == ((1 + 40 / 60) / 2, 2, 55.0, 8.5, 7.0, 0, 2)
