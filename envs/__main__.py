@@ -61,7 +61,7 @@ def about_task(id: str) -> str:
 
   {train}
 
---minutes M sets a time in place of a number of env steps; --help shows the defaults."""
+--minutes M sets a time in place of env steps. --help shows the defaults."""
     return "\n\n".join([id, _sizes(env), *said, *_settings(env), how])
 
 

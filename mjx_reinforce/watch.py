@@ -37,15 +37,15 @@ class WatchSettings:
     """A run directory; a folder of runs, of which the newest plays; or a task such as
     HalfCheetah-v5, whose trained policy comes with the package."""
     env: str | None = None
-    """If the run was trained on module:Class, that name again: its code runs only if named."""
+    """Your own task that the run was trained on, module:Class. Its code runs only if named here."""
     policy: str | None = None
-    """If the distribution of the run is module:name, that name again."""
+    """Your own distribution that the run was trained with, module:name."""
     seed: SeedChoice = "best"
     """Seed that plays: best, worst or median by its final evaluation, or a number."""
     which: Which = "last"
     """The policy at the end of training (last), or the best at any evaluation, if it was kept."""
     beside: Literal["untrained"] | None = None
-    """A second policy, on the left, from the same start: before and after training."""
+    """Show the policy before training on the left, from the same start."""
     episode: int = 0
     """Number of the start state. The same number gives the same start."""
     noise: bool = False
@@ -53,7 +53,7 @@ class WatchSettings:
     output: Path | None = None
     """The video, .gif. By default RUN/seed-NUMBER.gif, or TASK.gif for a policy of the package."""
     seconds: float = 20.0
-    """Most simulated seconds that the video shows. The episode is played to its end."""
+    """The longest video, in simulated seconds. The episode is still played to its end."""
     width: int = 480
     """Width of each policy's picture, in pixels."""
     height: int = 360

@@ -18,7 +18,7 @@ class Ant(Healthy):
     ``exclude_current_positions_from_observation=False`` x and y (m) come first. Action, A = 8:
     torques in [-1, 1] on hip and ankle of the legs 4, 1, 2, 3, times a gear of 150 (N m).
 
-    Reward: the speed of ``main_body`` along x over the step (m/s), plus 1 if healthy, less 0.5
+    Reward: the speed of ``main_body`` along x over the step (m/s), plus 1 if healthy, minus 0.5
     times the sum of the squared actions and 5e-4 times that of the clipped contact forces. Start:
     positions uniform within ``reset_noise_scale`` of the pose, velocities normal with that
     deviation. Terminates when not healthy: height outside [0.2, 1] m, or not finite. Solved at a

@@ -19,7 +19,7 @@ class Reacher(MujocoEnv):
     """Gymnasium's Reacher (gymnasium/envs/mujoco/reacher_v5.py).
 
     Observation, O = 10: cosines of the two joint angles; their sines; target position x, y (m);
-    the joints' angular velocities (rad/s); fingertip less target, x, y (m). Action, A = 2:
+    the joints' angular velocities (rad/s); fingertip minus target, x, y (m). Action, A = 2:
     torques in [-1, 1], times a gear of 200 (N m).
 
     Reward: minus the distance from fingertip to target (m), minus the sum of the squared actions.
@@ -72,7 +72,7 @@ class Reacher(MujocoEnv):
         return sum(terms.values()), jnp.zeros((), bool), terms
 
     def _away(self, data):
-        """Returns fingertip less target [3] (m).
+        """Returns fingertip minus target [3] (m).
 
         Both positions are those of the last Runge-Kutta stage, as in Gymnasium, not those of the
         new qpos.

@@ -71,7 +71,7 @@ class Humanoid(Person, Healthy):
     100, hip y 300, knee 200, arms 25 (N m).
 
     Reward: 1.25 times the speed of the mass center along x over the step (m/s), plus 5 if healthy,
-    less 0.1 times the sum of the squared actions and 5e-7 times that of the contact forces, the
+    minus 0.1 times the sum of the squared actions and 5e-7 times that of the contact forces, the
     latter at most 10. Start: every position and velocity uniform within ``reset_noise_scale`` of
     standing at rest. Terminates when the torso's height leaves (1, 2) m. No threshold; at most 1000
     steps of 0.015 s.
@@ -117,7 +117,7 @@ class HumanoidStandup(Person):
     Observation, O = 348, and action, A = 17: as Humanoid.
 
     Reward: the torso's height (m) over the physics timestep of 0.003 s, not over the env step, plus
-    1, less 0.1 times the sum of the squared actions and 5e-7 times that of the contact forces, the
+    1, minus 0.1 times the sum of the squared actions and 5e-7 times that of the contact forces, the
     latter at most 10. Start: every position and velocity uniform within ``reset_noise_scale`` of
     lying at rest. Never terminates. No threshold; at most 1000 steps of 0.015 s.
     """

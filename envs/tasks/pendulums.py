@@ -53,7 +53,7 @@ class InvertedDoublePendulum(NearPose):
     against the end of the rail. Action, A = 1: force on the cart in [-1, 1], times a gear of
     500 (N).
 
-    Reward: 10 each step the tip stays up, less 0.01 x^2 + (y - 2)^2 for the tip's position x, y
+    Reward: 10 each step the tip stays up, minus 0.01 x^2 and (y - 2)^2 for the tip's position x, y
     (m) and 1e-3 v1^2 + 5e-3 v2^2 for the angular velocities. Start: positions uniform within
     ``reset_noise_scale``, velocities normal with that standard deviation. Terminates when the
     tip is at 1 m or lower, of 1.2 m. Solved at a return of 9100; at most 1000 steps of 0.05 s.

@@ -18,7 +18,7 @@ class HalfCheetah(Runner):
     torques in [-1, 1] on the back thigh, shin and foot and the front ones, times gears of 120, 90,
     60, 120, 60 and 30 (N m).
 
-    Reward: the speed along x over the step (m/s) less 0.1 times the sum of the squared actions.
+    Reward: the speed along x over the step (m/s) minus 0.1 times the sum of the squared actions.
     Start: positions uniform within ``reset_noise_scale`` of the pose, velocities normal with that
     deviation. Never terminates. Solved at a return of 4800; at most 1000 steps of 0.05 s.
     """
@@ -45,7 +45,7 @@ class Swimmer(Runner):
     ``exclude_current_positions_from_observation=False`` the tip's x and y (m) come first, O = 10.
     Action, A = 2: torques on the joints in [-1, 1], times a gear of 150 (N m).
 
-    Reward: the tip's speed along x over the step (m/s) less 1e-4 times the sum of the squared
+    Reward: the tip's speed along x over the step (m/s) minus 1e-4 times the sum of the squared
     actions. Start: every position and velocity uniform within ``reset_noise_scale`` of the
     straight rods at rest. Never terminates. Solved at a return of 360; at most 1000 steps of
     0.04 s.
@@ -97,7 +97,7 @@ class Hopper(PlanarWalker):
     to [-10, 10]. With ``exclude_current_positions_from_observation=False`` x (m) comes first,
     O = 12. Action, A = 3: torques on thigh, leg and foot in [-1, 1], times a gear of 200 (N m).
 
-    Reward: the speed along x over the step (m/s), plus 1 if healthy, less 1e-3 times the sum of
+    Reward: the speed along x over the step (m/s), plus 1 if healthy, minus 1e-3 times the sum of
     the squared actions. Start: every position and velocity uniform within ``reset_noise_scale``
     of standing at rest. Terminates when not healthy: height at most 0.7 m, torso 0.2 rad or more
     off upright, or an angle or a velocity outside (-100, 100). Solved at a return of 3800; at
@@ -136,7 +136,7 @@ class Walker2d(PlanarWalker):
     torques in [-1, 1] on the right thigh, leg and foot and the left ones, times a gear of 100
     (N m).
 
-    Reward: the speed along x over the step (m/s), plus 1 if healthy, less 1e-3 times the sum of
+    Reward: the speed along x over the step (m/s), plus 1 if healthy, minus 1e-3 times the sum of
     the squared actions. Start: every position and velocity uniform within ``reset_noise_scale``
     of standing at rest. Terminates when not healthy: height outside (0.8, 2) m or torso angle
     outside (-1, 1) rad. No threshold; at most 1000 steps of 0.008 s.

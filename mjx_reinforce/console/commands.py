@@ -46,5 +46,5 @@ def menu(version: str) -> str:
     return (
         f"{SCRIPT} {version}: REINFORCE on MuJoCo, many seeds in one compiled program\n\n"
         + "\n".join(lines)
-        + f"\n\nTo begin: {SCRIPT} train. For all about a command: {SCRIPT} COMMAND --help."
+        + f"\n\nTo begin: {SCRIPT} train. Help for a command: {SCRIPT} COMMAND --help."
     )

@@ -12,7 +12,7 @@ from mjx_reinforce.settings.flags import run_command
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ExportSettings:
-    """Write a trained policy as NumPy alone: an archive .npz and a short .py, without noise."""
+    """Write a trained policy for NumPy alone: an .npz archive and a short .py. It has no noise."""
 
     run: tyro.conf.Positional[Path]
     """A run directory, or a task whose trained policy comes with the package."""

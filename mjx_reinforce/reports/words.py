@@ -87,13 +87,13 @@ def headline(findings: Findings) -> list[str]:
         said = f"{seeds} of {findings.experiment.env} ended with {mean}{before}."
         return [said, *_solving(findings)]
     name, ties = best.configuration.label, _ties(findings)
-    first = f"Best by the mean is {name}: it ended with {mean}."
+    first = f"By the mean, the best is {name}. It ended with {mean}."
     if findings.comparisons and not ties:
-        first = f"The best is {name}: it ended with {mean}."
+        first = f"The best is {name}. It ended with {mean}."
     said = [first, *_ahead(findings), *_solving(findings), *_few(findings)]
     speed = _speed(findings)
     if speed and ties and len(ties) == len(of_best(findings)):
-        return [f"{speed}; the final returns are a tie.", *said]
+        return [f"{speed}. The final returns are a tie.", *said]
     return [*said, f"{speed}."] if speed else said
 
 
@@ -149,12 +149,12 @@ def _few(findings: Findings) -> Iterator[str]:
     best, second = (each.scores for each in findings.results[:2])
     counts = [count for count in _COUNTS if 10 * count <= min(len(best), len(second))]
     if counts and best.mean() != second.mean():
-        wrong = [f"{percent(wrong_winner(best, second, n))} of the time with {n}" for n in counts]
+        wrong = [f"{n} seeds {percent(wrong_winner(best, second, n))} of the time" for n in counts]
         needed = seeds_needed(best, second)
-        found = f"{needed:,} of each would" if needed else "10,000 of each would not"
+        found = f"{needed:,} seeds of each would" if needed else "10,000 seeds of each would not"
         yield (
-            f"With few seeds, the next would have looked better than the best {', '.join(wrong)}; "
-            f"{found} find it four times out of five."
+            f"Few seeds would have named the wrong winner: {', '.join(wrong)}. {found} find the "
+            "difference four times out of five."
         )
 
 
@@ -164,7 +164,7 @@ def _speed(findings: Findings) -> str:
     pairs = findings.speeds.items()
     slower = [names[sum(pair) - order[0]] for pair, p in pairs if order[0] in pair and p < LEVEL]
     if slower and len(slower) == len(names) - 1:
-        return f"Fastest is {names[order[0]]}"
+        return f"The fastest is {names[order[0]]}"
     return f"{names[order[0]]} is surely faster than {_listed(slower)}" if slower else ""
 
 
@@ -173,13 +173,13 @@ def caveats(findings: Findings) -> Iterator[str]:
     experiment, results = findings.experiment, findings.results
     sizes = [len(each.final) for each in results]
     for each in experiment.unfinished:
-        yield f"{each} is not finished: these are its results so far."
+        yield f"{each} is not finished. These are its results so far."
     for name in map(setting_in_words, experiment.disagree):
-        yield f"The sources were made with different {name}; see where they come from."
+        yield f'The sources were made with different {name}: see "Where this comes from".'
     if min(sizes) < _FEW_SEEDS:
         yield (
-            f"{counted(min(sizes), 'seed')} of a configuration are few: below {_FEW_SEEDS}, an "
-            "interval holds the truth less often than 95% of the time; below six there is none."
+            f"{counted(min(sizes), 'seed')} per configuration: with fewer than {_FEW_SEEDS}, "
+            "intervals hold the truth less than 95% of the time. Below six, there are none."
         )
     if failed := sum(int(np.sum(~np.isfinite(each.final))) for each in results):
         yield (
@@ -188,14 +188,14 @@ def caveats(findings: Findings) -> Iterator[str]:
         )
     if len(results) > 1:
         yield (
-            f"The best was chosen among {len(results):,} by the same seeds that give its figures, "
-            "so they are a little too good. Train it with fresh seeds before you quote them."
+            f"The best of {len(results):,} was chosen by the same seeds that give its numbers, so "
+            "these are a little too good. Train it with fresh seeds before you quote them."
         )
         names = " and ".join(map(setting_in_words, results[0].configuration.settings))
         if names and experiment.env in OF_TASKS:
             yield (
-                "The other settings, where you gave none, are defaults that were chosen with one "
-                f"value of {names}: tune them for each configuration before you choose."
+                f"Settings that you did not give are defaults, tuned for one value of {names}. "
+                "Tune them for each configuration before you choose."
             )
     yield from _edges(findings)
     ends = [float(np.median(each.configuration.env_steps[-1])) for each in results]
@@ -205,8 +205,8 @@ def caveats(findings: Findings) -> Iterator[str]:
             "judged at its own end."
         )
     if _rises(results[0].band):
-        yield "The best was still rising at the end: a longer training may change the order."
-    yield "One task: nothing here says how these settings do on another."
+        yield "The best was still rising at the end. A longer training may change the order."
+    yield "This is one task. Nothing here says how these settings do on another."
 
 
 def _edges(findings: Findings) -> Iterator[str]:

@@ -56,7 +56,7 @@ def read_command_line(
       ValueError: a word or a value is empty, which would be read as the current folder.
     """
     if any(not word or re.fullmatch("--.*=", word) for word in arguments):
-        raise ValueError("a value on the command line is empty: is a variable of the shell unset?")
+        raise ValueError("a value on the command line is empty; is a variable of the shell unset?")
     _give_help(form)
     options: dict[str, Any] = {"registry": _READERS, "config": (tyro.conf.OmitArgPrefixes,)}
     return tyro.cli(form, prog=prog, description=description, args=arguments, **options)

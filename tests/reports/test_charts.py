@@ -75,7 +75,7 @@ def test_axes_end_where_the_data_do(found, drawn):
 
 def test_defaults_are_named_where_settings_are_compared(found):
     """What a reviewer asks first; of a task without settings of its own there is nothing to say."""
-    said = "chosen with one value of learning rate and discount"
+    said = "tuned for one value of learning rate and discount"
     assert any(said in one for one in words.caveats(found))
     own = found._replace(experiment=found.experiment._replace(env="own:Task"))
     assert not any(said in one for one in words.caveats(own))

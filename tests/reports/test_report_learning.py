@@ -46,7 +46,7 @@ def test_seeds_that_all_solve_are_told_apart_by_their_speed(tmp_path):
     all_solve(directory, [6, 2, 9])
     found = findings_of(directory)
     said = words.headline(found)
-    assert said[0] == "Fastest is learning rate 0.003; the final returns are a tie."
+    assert said[0] == "The fastest is learning rate 0.003. The final returns are a tie."
     rows = listings.listings(found)["speed"]["rows"]
     assert [row["label"][-5:] for row in rows] == ["0.003", "0.001", " 0.01"]
     assert rows[0]["cells"][2][0] == "fastest"
@@ -57,7 +57,7 @@ def test_equal_speeds_are_not_told_apart(tmp_path):
     directory = make_sweep(tmp_path / "sweep", num_seeds=24, over=RATES)
     all_solve(directory, [4, 4, 4])
     found = findings_of(directory)
-    assert not re.search("faster|Fastest", " ".join(words.headline(found)))
+    assert not re.search("faster|fastest", " ".join(words.headline(found)))
     assert {*found.speeds.values()} == {1.0}
 
 
@@ -66,14 +66,14 @@ def test_what_is_surely_slower_is_named_where_two_are_equally_fast(tmp_path):
     all_solve(directory, [6, 2, 2])
     said = words.headline(findings_of(directory))
     slower = 'faster than "learning rate 0.001"'
-    assert said[0] == f"learning rate 0.01 is surely {slower}; the final returns are a tie."
+    assert said[0] == f"learning rate 0.01 is surely {slower}. The final returns are a tie."
 
 
 def test_nobody_solves_it_is_no_race(tmp_path):
     directory = make_sweep(tmp_path / "sweep", num_seeds=12, over=RATES)
     change_curves(directory, lambda x: np.minimum(x["eval_return"], 500, out=x["eval_return"]))
     found = findings_of(directory)
-    assert not re.search("faster|Fastest", " ".join(words.headline(found)))
+    assert not re.search("faster|fastest", " ".join(words.headline(found)))
     table = listings.listings(found)["speed"]
     assert table["header"][2:] == ["return while training"]
     areas = sorted((each.area.value for each in found.results), reverse=True)

@@ -64,7 +64,7 @@ def test_a_page_has_sizes_rules_settings_and_how_to_train(register):
     config = Config()
     assert train == f"To train {config.num_seeds} seeds for {config.env_steps:,} env steps each:"
     assert command.endswith(" --env Told-v0")
-    assert time.startswith("--minutes M sets a time in place of a number of env steps; --help")
+    assert time.startswith("--minutes M sets a time in place of env steps. --help")
 
 
 def test_what_a_task_does_not_say(register):

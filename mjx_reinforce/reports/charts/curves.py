@@ -41,9 +41,9 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         title="Learning curves",
         caption=(
             "The interquartile mean over seeds of the return without exploration, and its 95% "
-            "bootstrap interval; with one configuration shown, thin lines are single seeds, from "
-            "worst to best. The dotted line is the slider's time below. Point at a curve to read "
-            f"it.{beyond}"
+            "bootstrap interval. With one configuration shown, thin lines are single seeds, from "
+            "worst to best. The dotted line is the time of the slider below. Point at a curve to "
+            f"read it.{beyond}"
         ),
         alt="Return over env steps, a line and a band for each configuration that is shown.",
         data={"curves": _bands(findings), "seeds": _seeds(findings)},

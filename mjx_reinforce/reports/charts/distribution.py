@@ -24,10 +24,10 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         name="distribution",
         title="Where the seeds are",
         caption=(
-            "Histograms of all seeds' returns, read off at the slider's time; its last place, "
-            "and what had ended before, is each seed's last evaluation, as in table 1. The "
-            "tallest bar of each row has its height, and the outermost bars hold what lies "
-            "beyond them."
+            "Histograms of all seeds' returns at the slider's time. At its end, and where a "
+            "configuration ended earlier, they show each seed's last evaluation, as in table 1. "
+            "The tallest bar of each row has the same height. The outermost bars include what "
+            "lies beyond them."
         ),
         alt="A histogram of returns for each configuration shown, with its median and worst.",
         data=_histograms(findings, borders),
