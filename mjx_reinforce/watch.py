@@ -95,8 +95,7 @@ def film(settings: WatchSettings) -> None:
         name, play = simulator(env, player, run.horizon)
         with Console(stderr=True).status("compiling and playing"):
             episode = play(settings.episode, settings.noise)
-        steps = f"{len(episode.rewards)} steps in {name}"
-        print(f"{label}: return {episode.total:.1f} in {steps}")
+        print(f"{label}: return {episode.total:.1f} in {len(episode.rewards)} steps in {name}")
         takes.append(Take(label, model, _within(env, "dt").dt, *episode))
     shown = side_by_side(takes, settings.width, settings.height, seconds=settings.seconds)
     samples = [*map(shown.draw, shown.samples)]
@@ -164,15 +163,17 @@ def untrained(player: "Player") -> "Player":
 def simulator(env: "Environment", player: "Player", horizon: int) -> tuple[str, Any]:
     """Returns the name of a simulation and a ``playing.Simulator``: C MuJoCo's, if that can play.
 
-    It starts at once. Ours is compiled first, which takes up to a minute, so that it says why.
+    It starts at once. Ours is compiled first, which takes up to a minute; of the user's own tasks
+    it says why.
     """
     from mjx_reinforce import playing
 
     try:
-        return "mujoco", playing.mujoco_simulator(env, player, horizon)
+        return "C MuJoCo", playing.mujoco_simulator(env, player, horizon)
     except Exception as error:  # of what a task of the user's own asks
-        warn(f"C MuJoCo cannot play this task ({explain(error)}), so MJX is compiled for it")
-        return "mjx", playing.simulator(env, player, horizon)
+        if not envs.is_ours(player.env):
+            warn(f"C MuJoCo cannot play this task ({explain(error)}), so JAX compiles it first")
+        return "JAX", playing.simulator(env, player, horizon)
 
 
 def scene(env: Any) -> Any:

@@ -162,7 +162,7 @@ def test_watch_plays_a_policy_of_the_package(tmp_path):
     ran = subprocess.run(command, check=True, capture_output=True, text=True, cwd=tmp_path)
     before, after, frames = (line for line in ran.stdout.splitlines() if line.strip())
     assert before.startswith("before training: return ")
-    assert after == "after training: return 1000.0 in 1000 steps in mujoco"
+    assert after == "after training: return 1000.0 in 1000 steps in C MuJoCo"
     assert frames == "75 frames in InvertedPendulum-v5.gif: 3 of 40 s; --seconds 40 shows all"
     shown = [*pictures(tmp_path / "InvertedPendulum-v5.gif")]
     assert shown[0].shape == (102, 240, 3)
