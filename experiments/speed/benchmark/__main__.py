@@ -87,8 +87,8 @@ SHOWN_ON_CPU = "InvertedPendulum-v5"
 class Settings:
     """Measure all that the documents say of speed, on a GPU or on two cores of a CPU."""
 
-    part: tyro.conf.Positional[Literal["gpu", "train", "cpu"]]
-    """gpu: rollouts; train: training on a GPU; cpu: rollouts on two cores."""
+    part: tyro.conf.Positional[Literal["gpu", "cpu"]]
+    """gpu: rollouts on a GPU; cpu: on two cores."""
     minutes: float = 5.0
     """What this may take; what is not done by then is left out."""
     csv: Path = RAW
@@ -118,7 +118,7 @@ def conduct(settings: Settings) -> None:
     """Lets all tasks compile at once, then time one by one."""
     began = time.monotonic()
     date = now()
-    every = {"cpu": list(CPU), "gpu": list(GPU), "train": list(GPU)}
+    every = {"cpu": list(CPU), "gpu": list(GPU)}
     tasks = list(settings.tasks or every[settings.part])
     started = {task: start(task, i, date, settings) for i, task in enumerate(tasks)}
     try:
@@ -215,7 +215,7 @@ def work(settings: Settings) -> None:
 
     jax.config.update("jax_default_matmul_precision", "highest")
     (task,) = settings.tasks
-    prepare = {"gpu": on_gpu, "train": trainings, "cpu": on_cpu}[settings.part]
+    prepare = {"gpu": on_gpu, "cpu": on_cpu}[settings.part]
     candidates = prepare(task, settings.shrink)
     print("compiled", flush=True)
     if sys.stdin.readline().strip() != "go":
@@ -261,14 +261,6 @@ def on_gpu(task: str, shrink: int) -> Callable[[], list[Candidate]]:
         return sum((added(task, number // shrink) for number in worlds), ours + others)
 
     return candidates
-
-
-def trainings(task: str, shrink: int) -> Callable[[], list[Candidate]]:
-    """Training updates of a 64-64 policy."""
-    from experiments.speed.benchmark.ours import training
-
-    update = training(task, "native", GPU[task].batch // shrink, 100)
-    return lambda: [update]
 
 
 def on_cpu(task: str, shrink: int) -> Callable[[], list[Candidate]]:

@@ -1,6 +1,5 @@
 """Our engines, as `python -m experiments.speed.benchmark` times them."""
 
-import dataclasses
 import time
 from collections.abc import Callable
 from functools import partial
@@ -12,7 +11,7 @@ from flax import struct
 from mujoco import mjx
 
 from experiments.speed.benchmark.rows import Candidate
-from mjx_reinforce import Actor, act, envs, mlp_policy, reinforce
+from mjx_reinforce import Actor, act, envs, mlp_policy
 from mjx_reinforce.engine.base import action_space, observation_size
 from mjx_reinforce.engine.play.choice import ActingPolicy, choose
 from mjx_reinforce.learning import normalize
@@ -89,28 +88,6 @@ def rollout_of(
         return compiled(row, play, actor, batch * steps, choosing)
 
     return of
-
-
-def training(env_id: str, name: str, batch: int, steps: int) -> Candidate:
-    """Whole updates of a 64-64 policy in float32: rollout, estimator, gradient and optimizer."""
-    env = Loop(envs.make(env_id), steps)
-    policy = mlp_policy(observation_size(env), default_distribution(action_space(env)), (64, 64))
-    began = time.perf_counter()
-    learner = reinforce(env, policy=policy, num_episodes=batch, engine=ENGINES[name])
-    choosing = time.perf_counter() - began
-    state = learner.init(jax.random.key(0))
-
-    def update(state, key):
-        return learner.step(dataclasses.replace(state, key=key))
-
-    row = {
-        "what": "training, untrained 64-64 policy",
-        "engine": name,
-        "task": env_id,
-        "precision": "float32",
-    }
-    row |= {"batch": batch, "steps": steps}
-    return compiled(row, update, state, batch * steps, choosing)
 
 
 def compiled(

@@ -26,42 +26,25 @@ OTHERS = (
 class Raw(NamedTuple):
     """The rows of each kind of call (`all.py`), of its last date for each task.
 
-    gpu: rollouts on a GPU, and C MuJoCo on its machine
-    train: training on a GPU
-    cpu: rollouts on two cores
+    gpu: on a GPU, and C MuJoCo on its machine
+    cpu: on two cores
     """
 
     gpu: list[dict[str, Any]]
-    train: list[dict[str, Any]]
     cpu: list[dict[str, Any]]
 
 
 def last_calls(rows: list[dict[str, Any]]) -> Raw:
-    """Sorts rows by the kind of their call, and keeps each task's last call of a kind.
+    """Sorts rows by the kind of their call, and keeps each task's last call of a kind."""
+    on_gpu = {row["date"] for row in rows if row["device"] != "cpu"}
+    last = {(row["task"], row["date"] in on_gpu): row["date"] for row in sorted(rows, key=_date)}
+    now = [row for row in rows if row["date"] == last[row["task"], row["date"] in on_gpu]]
+    gpu, cpu = ([row for row in now if (row["date"] in on_gpu) == it] for it in (True, False))
+    return Raw(gpu, cpu)
 
-    A rollout with a trained policy counts only where a task has none with an untrained one.
-    """
-    rollouts = [row for row in rows if row["what"].startswith("rollout")]
-    on_gpu = {row["date"] for row in rollouts if row["device"] != "cpu"}
-    trained = {row["date"] for row in rollouts if row["what"].startswith("rollout, trained")}
-    found: dict[str, list[dict[str, Any]]] = {"gpu": [], "train": [], "cpu": []}
-    last: dict[tuple[str, str], tuple[bool, str]] = {}
 
-    def kind(row: dict[str, Any]) -> str:
-        if row["what"].startswith("training"):
-            return "train"
-        return "gpu" if row["date"] in on_gpu else "cpu"
-
-    def rank(row: dict[str, Any]) -> tuple[bool, str]:
-        return row["date"] not in trained, row["date"]
-
-    for row in rows:
-        key = row["task"], kind(row)
-        last[key] = max(last.get(key, rank(row)), rank(row))
-    for row in rows:
-        if rank(row) == last[row["task"], kind(row)]:
-            found[kind(row)].append(row)
-    return Raw(**found)
+def _date(row: dict[str, Any]) -> str:
+    return row["date"]
 
 
 def best(
@@ -161,17 +144,14 @@ def gpu(raw: Raw) -> str:
     for task in tasks_of(raw.gpu):
         native, warp = best(raw.gpu, task, "native"), best(raw.gpu, task, "MuJoCo Warp")
         plain, c_mujoco = best(raw.gpu, task, "plain MJX"), best(raw.gpu, task, "C MuJoCo")
-        cells = (task.rpartition(":")[2], rate(native), at(native), rate(warp), at(warp))
-        training = best(raw.train, task, "native")
-        rows.append(
-            (*cells, ratio(native, warp), rate(plain), at(plain), rate(c_mujoco), rate(training))
-        )
+        card = "" if native is None else native["device"].split()[1]
+        cells = (task.rpartition(":")[2], card, rate(native), at(native), rate(warp), at(warp))
+        rows.append((*cells, ratio(native, warp), rate(plain), at(plain), rate(c_mujoco)))
     header = (
-        *("task", "native", "episodes x steps", "MuJoCo Warp", "worlds x steps", "native / Warp"),
-        *("plain MJX", "its episodes x steps", "C MuJoCo, all threads, float64"),
-        "training, native, 64-64",
+        *("task", "on", "native", "episodes x steps", "MuJoCo Warp", "worlds x steps"),
+        *("native / Warp", "plain MJX", "its episodes x steps", "C MuJoCo, all threads, float64"),
     )
-    return f"{origin(raw.gpu + raw.train)}\n\n{table(header, rows)}"
+    return f"{origin(raw.gpu)}\n\n{table(header, rows)}"
 
 
 def cpu(raw: Raw) -> str:
