@@ -12,7 +12,7 @@ from mjx_reinforce.files import write_bytes
 from mjx_reinforce.watch import scene
 
 #: The tasks side by side, and the size of a file at most (bytes).
-_TASKS = ("Hopper-v5", "HalfCheetah-v5", "Walker2d-v5", "Ant-v5", "Humanoid-v5")
+_TASKS = ("Hopper-v5", "HalfCheetah-v5", "Ant-v5", "Humanoid-v5", "HumanoidStandup-v5")
 LARGEST = 300_000
 #: How many colors a film has, if it may not have more.
 _FEWER_COLORS = (128, 64, 32, 16, 8)
@@ -23,8 +23,8 @@ def write(folder: Path, arm: Path | None) -> None:
     import_mujoco()
     configure_jax()
     folder.mkdir(parents=True, exist_ok=True)
-    tasks = [_take(load(name), name.removesuffix("-v5")) for name in _TASKS]
-    save(folder / "tasks.gif", side_by_side(tasks, 160, 176, seconds=2.5, max_rate=12))
+    tasks = [_take(load(name), name[:-3].replace("HumanoidStandup", "Standup")) for name in _TASKS]
+    save(folder / "tasks.gif", side_by_side(tasks, 190, 180, seconds=2.0, max_rate=10))
     if arm is not None:
         player = load(arm)
         balls = [_take(player, f"ball {i + 1}", episode=i) for i in range(3)]

@@ -223,7 +223,7 @@ def readme(groups: Sequence[Group], docs: Path) -> str:
         if figure := kept.published(docs / "published.csv", task, "PPO"):
             cells[3] = _round(figure.mean)
         rows.append([task, *cells])
-    header = ["task", "two cores, a minute", "one H100, a minute", "one H100, at the end", "PPO"]
+    header = ["task", "two cores, a minute", "one GPU, a minute", "one GPU, at the end", "PPO"]
     return table(header, rows)
 
 
