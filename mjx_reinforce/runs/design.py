@@ -16,7 +16,6 @@ from mjx_reinforce.console.commands import command
 from mjx_reinforce.engine.checks import check_name, nearest, read_as, spoken_kind
 from mjx_reinforce.engine.memory import gigabytes, host_memory
 from mjx_reinforce.files import naming_damage
-from mjx_reinforce.runs.sinks import check_installed
 from mjx_reinforce.settings.config import (
     Config,
     changed,
@@ -142,7 +141,6 @@ def check_design(design: Design) -> None:
     for name in set(design.given).difference(design.over):
         if not any(is_read(name, config) for config in design.configs):
             check_read(design.configs[0], [name])
-    check_installed(design.base)
 
 
 def _check_sweep(design: Design) -> None:

@@ -17,7 +17,7 @@ from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.registry import find_algorithm, is_own
 from mjx_reinforce.reports.experiment import counted
 from mjx_reinforce.runs.design import Design
-from mjx_reinforce.settings.config import MAX_COUNT, Config, is_read, marked
+from mjx_reinforce.settings.config import Config, is_read, marked
 from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.defaults import num_cores
 from mjx_reinforce.settings.groups import Reader
@@ -109,16 +109,17 @@ def prepare(
     Raises:
       ValueError: settings do not fit the environment, or it cannot go on here.
     """
-    clock = Stopwatch()
+    clock, found = Stopwatch(), None
     if design.base.resume is not None:
         resume.check_same_program(design.directory, known, provenance())
+        found = None if design.over else resume.newest_checkpoint(design.base, say)
     if design.over:
         return Prepared(design, *_prepare_sweep(design, known), known, None, None, clock)
     config, division, actors = design.base, divide_run(design.base), None
-    found = None if config.resume is None else _find(config, say)
     ready = get_ready(config, design.default or config, env, division)
     if config.init_from is not None and found is None:
         actors = last_actors(config, ready.policy)
+    config = dataclasses.replace(config, horizon=ready.horizon)
     group, width = Group(config, np.zeros(1, int), {}), division.lanes(config.num_seeds)
     part = Part(group, ready, config.num_seeds, width, split_runs(group, "000", 1))
     return Prepared(design, [part], division, known, found, actors, clock)
@@ -145,24 +146,6 @@ def divide_run(config: Config) -> Division:
     enough = each >= _LEAST or jax.default_backend() == "cpu"
     # How many seeds' episodes a device plays, by either.
     return Division(episodes=episodes) if enough and num_seeds / episodes < width else by_seeds
-
-
-def _find(config: Config, say: Callable[[str], None]) -> Checkpoint | None:
-    """Returns the checkpoint from which a run in its directory goes on, if there is one.
-
-    Raises:
-      ValueError: the run cannot go on here.
-    """
-    if config.minutes is None:
-        return resume.newest_checkpoint(config, say)
-    # More than any checkpoint has used.
-    found = resume.newest_checkpoint(dataclasses.replace(config, env_steps=MAX_COUNT), say)
-    if found is None:
-        raise ValueError(
-            f"{config.resume} has no checkpoint to go on from for {config.minutes:g} min; leave "
-            "--minutes out to train it again, or start another run"
-        )
-    return found
 
 
 def _prepare_sweep(design: Design, known: Mapping[str, Any]) -> tuple[list[Part], Division]:

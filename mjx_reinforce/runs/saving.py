@@ -335,7 +335,7 @@ class SweepFiles(Files[Training]):
     def _write_part(self, driver: Training) -> None:
         """Writes what a chunk measured, and the last policies of each configuration's ends."""
         record, runs = driver.record, driver.runs
-        found = record.history() | runs._asdict() | {"nonfinite": record.nonfinite}
+        found = since_their_end(record.history()) | runs._asdict() | {"nonfinite": record.nonfinite}
         curves = {name: found[name].astype(kind) for name, kind in _CURVES.items()}
         last = {name: curves[name] for name in ("configuration", "seed")}
         last["eval_return"] = curves["eval_return"][-1]
@@ -387,6 +387,17 @@ def _ends(last: Arrays, number: int) -> np.ndarray:
     runs = runs[np.argsort(last["seed"][runs])]
     values = np.nan_to_num(last["eval_return"][runs], nan=-np.inf)
     return runs[sorted({int(values.argmin()), int(values.argmax())})]
+
+
+def since_their_end(history: Arrays) -> Arrays:
+    """Returns rows [E, R] of a chunk in which runs that ended have their last evaluation at once.
+
+    It is made when all have ended; until then their rows repeat the one before. So a run has the
+    same rows whatever is beside it.
+    """
+    steps = history["env_steps"]
+    ended = np.cumsum(steps[1:] == steps[:-1], axis=0) > 0
+    return {n: np.concatenate([x[:1], np.where(ended, x[-1], x[1:])]) for n, x in history.items()}
 
 
 def join_parts(parts: Sequence[Mapping[str, np.ndarray]]) -> Arrays:

@@ -8,7 +8,6 @@ Weights & Biases, offline unless WANDB_MODE says otherwise.
 
 import contextlib
 import importlib
-import importlib.util
 import os
 import secrets
 import socket
@@ -23,23 +22,6 @@ import numpy as np
 from mjx_reinforce.files import Arrays, append, read_json, write_json
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import iqm, iqm_interval
-
-#: The package that each needs.
-_NEEDED = {"tensorboard": "tensorboardX", "wandb": "wandb"}
-
-
-def check_installed(config: Config) -> None:
-    """Raises ValueError for a sink whose package is missing; imports nothing."""
-    for name in config.log:
-        package = _NEEDED[name]
-        spec = importlib.util.find_spec(package)
-        # A folder of that name, such as W&B leaves, is found too, but has no origin.
-        if spec is None or spec.origin is None:
-            raise ValueError(
-                f"--log {name} needs the package {package}, which is not installed; "
-                f"pip install {package}, or leave {name} out"
-            )
-
 
 #: Seeds that are shown one by one, the first ones: each is a curve for every column.
 MAX_SINGLE_SEEDS = 16

@@ -3,6 +3,7 @@
 import dataclasses
 import enum
 import functools
+import importlib.util
 import reprlib
 import shlex
 from collections.abc import Collection, Mapping
@@ -138,11 +139,29 @@ def check_each(config: Config) -> None:
     check_choice("algorithm", config.algorithm, ALGORITHMS)
     check_choice("policy", config.policy, {"auto": None} | DISTRIBUTIONS)
     check_choice("estimator", config.estimator, ESTIMATORS)
+    for name in config.log:
+        _check_installed(name)
     for rule in Range:
         for name in marked(rule):
             value = getattr(config, name)
             if not (value is None or isinstance(value, str) or rule.holds(value)):
                 raise ValueError(f"{flag(name)} must be {rule.said}, got {reprlib.repr(value)}")
+
+
+#: The package that each log needs.
+_NEEDED = {"tensorboard": "tensorboardX", "wandb": "wandb"}
+
+
+def _check_installed(log: str) -> None:
+    """Raises ValueError if a log's package is missing; imports nothing."""
+    package = _NEEDED[log]
+    spec = importlib.util.find_spec(package)
+    # A folder of that name, such as W&B leaves, is found too, but has no origin.
+    if spec is None or spec.origin is None:
+        raise ValueError(
+            f"--log {log} needs the package {package}, which is not installed; pip install "
+            f"{package}, or leave {log} out"
+        )
 
 
 def flag(name: str) -> str:

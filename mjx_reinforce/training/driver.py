@@ -1,5 +1,6 @@
 """Runs as they go on: their programs move them, and observers see what they measure."""
 
+import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -11,10 +12,10 @@ from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import MAX_COUNT, Config
-from mjx_reinforce.training.record import Measured, Record, RunRecord
+from mjx_reinforce.training.record import HOPELESS, Measured, Record, RunRecord
 from mjx_reinforce.training.resume import Checkpoint, decisive
 from mjx_reinforce.training.slots import Slots
-from mjx_reinforce.training.state import Best, StateRows, first_best, keep_best
+from mjx_reinforce.training.state import Best, Budget, StateRows, begin_with, first_best, keep_best
 
 
 class Evaluation(NamedTuple):
@@ -281,3 +282,105 @@ class Driver(Training):
             self.record.add_test(result)
             returns[f"{name}_test_returns"] = result["eval_return"].tolist()
         return returns
+
+    def summary(self, engine: str, compile_seconds: float, test: dict[str, Any]) -> dict[str, Any]:
+        """Returns the contents of summary.json, at the end of the run.
+
+        Args:
+          engine: the name of the engine that played.
+          compile_seconds: wall time of compiling.
+          test: from ``test``, empty if the run was interrupted.
+        """
+        status = {"status": "finished" if test else "interrupted"}
+        if test and self.record.hopeless():
+            status = {"status": "stopped", "reason": HOPELESS}
+        return {
+            **status,
+            **self.record.summary(engine, compile_seconds, self.seconds()),
+            "best_updates": counts.to_int(self.best.num_updates).tolist(),
+            **test,
+        }
+
+
+def begin_run(
+    config: Config,
+    threshold: float | None,
+    slots: Slots,
+    runs: Runs,
+    found: Checkpoint | None = None,
+    actors: Actor | None = None,
+    say: Callable[[str], None] = lambda text: None,
+    observers: Sequence[Observer[Any]] = (),
+    interrupted: Callable[[], bool] = lambda: False,
+) -> Driver:
+    """Returns a run before its first update.
+
+    Args:
+      config: its settings.
+      threshold: the return that counts as solved, if any.
+      slots: its seeds.
+      runs: the same, by their numbers.
+      found: the checkpoint from which it goes on, if any; an observer takes it back there.
+      actors: [S, ...] with which it begins, if not with its own.
+      say: shows a line to the user.
+      observers: who sees it.
+      interrupted: whether it is to end soon.
+    """
+    if found is not None:
+        check_layout(found, slots)  # before a file is touched
+    if actors is not None:
+        slots.restore(begin_with(slots.states(), actors))
+    if config.minutes is not None:
+        first = slots.rows()
+        if found is not None:
+            slots.restore(found.states)
+        env_steps = env_steps_in(60 * config.minutes, slots, config, interrupted)
+        slots.restore(first)
+        say(f"{config.minutes:g} min are about {env_steps:,} env steps per seed here")
+        config = dataclasses.replace(config, env_steps=env_steps, minutes=None)
+    slots.budget = Budget.of(config.env_steps, config.max_updates)
+    return Driver(config, slots, RunRecord(config, threshold), runs, observers)
+
+
+#: The part of the time in which its speed is measured; what is trained in it is trained again.
+_PART = 0.03
+
+
+def env_steps_in(
+    seconds: float, slots: Slots, config: Config, interrupted: Callable[[], bool] = lambda: False
+) -> int:
+    """Returns the env steps that a mean seed will have played in all after a time.
+
+    The seeds are trained, and evaluated, for a small part of that time. The speed of the second
+    half of that part counts: the first updates also have what a device does once, and the shortest
+    episodes.
+
+    Args:
+      seconds: the time.
+      slots: the seeds, where the run goes on.
+      config: the settings.
+      interrupted: whether the first update of the trial is to be the last.
+    """
+    most = MAX_COUNT if config.max_updates is None else config.max_updates
+    began, past = time.perf_counter(), [(0.0, *_played(slots))]
+    while past[-1][0] < _PART * seconds and not (past[1:] and interrupted()):
+        slots.budget = Budget.of(None, min(past[-1][2] + 2 ** (len(past) - 1), most))
+        if not slots.advance(look=False):
+            break  # no seed has an update left
+        past.append((time.perf_counter() - began, *_played(slots)))
+    if len(past) == 1:
+        return max(1, round(past[0][1]))
+    end, played, updates = past[-1]
+    half, before, made = next((x for x in past[1:-1] if x[0] >= end / 2), past[-2])
+    a_block = config.block_length * (end - half) / (updates - made)
+    evaluating = slots.seconds_to_evaluate()
+    speed = (played - before) / (end - half) * a_block / (a_block + evaluating)
+    left = max(seconds - end - evaluating, 0.0)
+    return min(max(1, round(past[0][1] + speed * left)), MAX_COUNT)
+
+
+def _played(slots: Slots) -> tuple[float, int]:
+    """Returns the env steps of the mean seed, and the updates of the seed with the most."""
+    states = slots.states().train_states
+    updates = counts.to_int(states.num_updates)
+    return float(counts.to_int(states.env_steps).mean()), int(updates.max())

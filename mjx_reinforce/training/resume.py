@@ -22,7 +22,7 @@ import numpy as np
 from mjx_reinforce.engine.checks import fits
 from mjx_reinforce.files import Arrays, check_stored, read_json, write_bytes
 from mjx_reinforce.settings.config import Config, flag, marked
-from mjx_reinforce.settings.declare import Mark
+from mjx_reinforce.settings.declare import MAX_COUNT, Mark
 
 #: What may change when a run goes on: when it ends, and how often it is saved.
 BUDGETS = marked(Mark.BUDGET)
@@ -308,9 +308,11 @@ def newest_checkpoint(config: Config, say: Callable[[str], None]) -> Checkpoint 
       say: shows a line about each file that does not serve.
 
     Raises:
-      ValueError: the budget is smaller than what the run did, config.json was edited, or a
-        checkpoint is another version's.
+      ValueError: the budget is smaller than what the run did, config.json was edited, a checkpoint
+        is another version's, or there is none for a budget in time.
     """
+    if config.minutes is not None:  # more than any checkpoint has used
+        config = dataclasses.replace(config, env_steps=MAX_COUNT)
     assert config.resume is not None
     metrics = config.resume / "metrics.csv"
     length = metrics.stat().st_size if metrics.exists() else 0
@@ -325,6 +327,11 @@ def newest_checkpoint(config: Config, say: Callable[[str], None]) -> Checkpoint 
             say(f"metrics.csv is shorter than at checkpoint {found.number}; trying the one before")
         elif _serves(found, config):
             return found
+    if config.minutes is not None:
+        raise ValueError(
+            f"{config.resume} has no checkpoint to go on from for {config.minutes:g} min; leave "
+            "--minutes out to train it again, or start another run"
+        )
     return None
 
 

@@ -29,7 +29,7 @@ from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import num_cores
 from mjx_reinforce.training.programs import Programs
 from mjx_reinforce.training.record import Measured
-from mjx_reinforce.training.state import Budget, RunState, StateRows, budget_of, shape_of_all
+from mjx_reinforce.training.state import Budget, RunState, StateRows, shape_of_all
 
 
 def pack_slots(chosen: np.ndarray, lengths: np.ndarray, width: int, num_devices: int) -> np.ndarray:
@@ -124,7 +124,7 @@ class Slots:
         """
         self._compiled, self._rides = compiled, compiled.programs.rides
         self._division, self.layout = compiled.programs.division, StateRows(compiled.programs.like)
-        self.budget = budget_of(compiled.config)
+        self.budget = Budget.of(compiled.config.env_steps, compiled.config.max_updates)
         width, count = compiled.width, len(numbers)
         kind = jnp.result_type(float)
         given = {name: x.astype(kind) for name, x in (settings or {}).items()}

@@ -51,11 +51,6 @@ class Budget(NamedTuple):
         return cls(*(counts.from_int(MAX_COUNT if x is None else x) for x in (env_steps, updates)))
 
 
-def budget_of(config: Config) -> Budget:
-    """Returns the budget; what has no limit has the greatest count."""
-    return Budget.of(config.env_steps, config.max_updates)
-
-
 def shape_of_all(like: RunState, num_runs: int) -> RunState:
     """Returns the shapes of the states of so many runs, from those of some."""
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_runs, *x.shape[1:]), x.dtype), like)

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from mjx_reinforce import envs
-from mjx_reinforce.runs import conduct
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store.ready import made
-from mjx_reinforce.training.driver import Runs
+from mjx_reinforce.training import driver as module
+from mjx_reinforce.training.driver import Runs, begin_run
+from mjx_reinforce.training.record import HOPELESS
 from mjx_reinforce.training.slots import compile_run
 
 CONFIG = Config(
@@ -30,7 +31,7 @@ def begin(ready, config, **more):
     """A run with these settings, without files, before its first update."""
     slots = compile_run(ready.programs(), config)
     runs = Runs("", *np.zeros((3, config.num_seeds), int))
-    return conduct.begin_run(config, ready, slots, runs, **more)
+    return begin_run(config, ready.threshold, slots, runs, **more)
 
 
 @pytest.fixture(scope="module")
@@ -47,30 +48,26 @@ def driver(ready):
 
 
 def test_a_summary_says_how_the_run_ended(driver, monkeypatch):
-    summary = conduct.summary_of(driver, "vmap", 3.0, {"final_test_returns": [1.0, 2.0]})
+    summary = driver.summary("vmap", 3.0, {"final_test_returns": [1.0, 2.0]})
     assert summary["status"] == "finished"
     assert "reason" not in summary
     assert summary["engine"] == "vmap"
     assert summary["compile_seconds"] == 3.0
     assert summary["final_test_returns"] == [1.0, 2.0]
     assert set(summary["best_updates"]) <= {0, 1, 2}
-    assert conduct.summary_of(driver, "vmap", 3.0, {})["status"] == "interrupted"
-    monkeypatch.setattr(driver, "ended", True)  # by an observer
-    ended = conduct.summary_of(driver, "vmap", 3.0, {"final_test_returns": []})
-    assert ended["status"] == "finished"
+    assert driver.summary("vmap", 3.0, {})["status"] == "interrupted"
     monkeypatch.setattr(driver.record, "hopeless", lambda: True)
-    stopped = conduct.summary_of(driver, "vmap", 3.0, {"final_test_returns": []})
-    assert (stopped["status"], stopped["reason"]) == ("stopped", conduct.HOPELESS)
+    stopped = driver.summary("vmap", 3.0, {"final_test_returns": []})
+    assert (stopped["status"], stopped["reason"]) == ("stopped", HOPELESS)
 
 
 def test_minutes_become_env_steps_before_the_run_begins(ready, monkeypatch):
     said = []
-    monkeypatch.setattr(conduct, "env_steps_in", lambda seconds, *_: int(1000 * seconds))
+    monkeypatch.setattr(module, "env_steps_in", lambda seconds, *_: int(1000 * seconds))
     timed = dataclasses.replace(CONFIG, minutes=0.5)
     driver = begin(ready, timed, say=said.append)
     assert (driver.config.env_steps, driver.config.minutes) == (30_000, None)
     assert said == ["0.5 min are about 30,000 env steps per seed here"]
-    assert driver.config.horizon == ready.horizon
 
 
 def test_a_run_begins_with_the_policies_of_another(ready, driver):

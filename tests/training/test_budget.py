@@ -10,11 +10,11 @@ import pytest
 
 from experiments.kit.trainings import results
 from mjx_reinforce.learning import counts
-from mjx_reinforce.runs import conduct
 from mjx_reinforce.runs.command_line import parse
 from mjx_reinforce.settings import defaults
 from mjx_reinforce.settings.config import MAX_COUNT, Config, check
 from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.training import driver
 from mjx_reinforce.training import record as measured
 
 SMALL = ["--env", "ContinuousCartPole-v0", "--num-seeds", "3", "--eval-episodes", "2"]
@@ -136,8 +136,8 @@ class Machine:
     ],
 )
 def test_what_is_trained_in_a_time(monkeypatch, seconds, machine, config, expected):
-    monkeypatch.setattr(conduct.time, "perf_counter", lambda: machine.now)
-    assert conduct.env_steps_in(seconds, machine, config) == expected
+    monkeypatch.setattr(driver.time, "perf_counter", lambda: machine.now)
+    assert driver.env_steps_in(seconds, machine, config) == expected
 
 
 # How much of a budget is used, and when a checkpoint is due.
