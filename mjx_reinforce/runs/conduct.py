@@ -46,7 +46,7 @@ def conduct(
     screen = display if prepared.alone else SweepScreen(display, prepared, left)
     everyone, clock = [*written, screen, *observers], prepared.clock
     chunks = _compiled([part for part in left if part.chunks], clock)
-    first = [*itertools.islice(chunks, 1)]
+    chunks = itertools.chain([*itertools.islice(chunks, 1)], chunks)  # compiles the first
     clock.compiling = time.perf_counter() - clock.began
     # Not before: a kill while it compiles leaves nothing that would refuse the next.
     interrupt.defer(display.say)
@@ -54,7 +54,7 @@ def conduct(
         each.open()
     display.start(clock.compiling)
     driver = None
-    for part, runs, compiled in itertools.chain(first, chunks):
+    for part, runs, compiled in chunks:
         config = dataclasses.replace(part.group.config, num_seeds=len(runs.seed))
         settings = {name: values[runs.place] for name, values in part.group.settings.items()}
         slots = Slots(compiled, runs.seed, settings)

@@ -125,9 +125,9 @@ def check_design(design: Design) -> None:
 
     A configuration reads each setting that is swept, and one of them each that was given.
     """
-    check_each(design.base)
     if design.over:
         _check_sweep(design)
+    check_each(design.base)
     runs = design.count() * design.base.num_seeds
     if runs * _RESULT > host_memory():
         raise ValueError(
