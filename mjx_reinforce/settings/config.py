@@ -134,13 +134,13 @@ def check_each(config: Config) -> None:
             f"--seeds {config.seeds} names {len(read_seeds(config.seeds))} seeds, and num_seeds is "
             f"{config.num_seeds}: make them agree"
         )
+    for name in config.log:
+        _check_installed(name)
     envs.check_id(config.env)
     split_words(config.env_set)
     check_choice("algorithm", config.algorithm, ALGORITHMS)
     check_choice("policy", config.policy, {"auto": None} | DISTRIBUTIONS)
     check_choice("estimator", config.estimator, ESTIMATORS)
-    for name in config.log:
-        _check_installed(name)
     for rule in Range:
         for name in marked(rule):
             value = getattr(config, name)

@@ -53,16 +53,18 @@ def build(
     """
     check_environment(env)
     horizon = check_horizon(env, config.horizon)
-    forever = config.normalize_steps is None
-    shared = {
-        "policy": build_policy(policy_settings(env, config)) if policy is None else policy,
+    forever, described = config.normalize_steps is None, policy_settings(env, config)
+    shared = {  # of all algorithms, the user's too
+        "policy": build_policy(described) if policy is None else policy,
         "horizon": config.training_horizon(horizon),
         "normalize_steps": math.inf if forever else config.normalize_steps,
         "normalize_min_std": config.normalize_min_std,
         "engine": config.engine,
     }
     if is_own(config.algorithm):
-        return _build_own(env, config, shared), horizon
+        learner = _made_by_user("algorithm", config.algorithm, ALGORITHMS, env, config, **shared)
+        wrappers.check_learner(config.algorithm, learner)
+        return learner, horizon
     algorithm = find_algorithm(config.algorithm)
     learner = load_definition(algorithm.make)(env, config, **shared)
     if not algorithm.search_episodes:
@@ -115,16 +117,6 @@ def _for_many_seeds(
         learner = schedules.Cut(cut_steps, config.whole_after)(learner)
     learner = wrappers.in_one_launch(learner, devices)
     return wrappers.short_episodes(learner, horizon, config.num_seeds, cut_steps)
-
-
-def _build_own(env: Environment, config: Config, shared: dict[str, Any]) -> Learner:
-    """Returns the learner of the user's own algorithm, a function of ``env``, ``config`` and these.
-
-    ``shared`` are the keywords that ``reinforce`` and ``ars`` have in common.
-    """
-    learner = _made_by_user("algorithm", config.algorithm, ALGORITHMS, env, config, **shared)
-    wrappers.check_learner(config.algorithm, learner)
-    return learner
 
 
 def _made_by_user(

@@ -116,7 +116,7 @@ def made(
     """
     devices = division.devices() if division.episodes > 1 else None
     learner, horizon = build(env, config, devices=devices)
-    threshold = getattr(env, "reward_threshold", None)
+    policy, threshold = policy_settings(env, config), getattr(env, "reward_threshold", None)
 
     def build_learner(settings: dict[str, Any]) -> Learner:
         if not settings:
@@ -139,7 +139,7 @@ def made(
     return Ready(
         horizon=horizon,
         threshold=None if threshold is None else float(threshold),
-        policy=policy_settings(env, config),
+        policy=policy,
         engine=learner.engine.name,
         why=learner.engine.why,
         programs=programs,
