@@ -190,7 +190,7 @@ def register(id: str, entry: Callable[..., Any], /, **kwargs: object) -> None:
 
     Raises:
       ValueError: the id is taken or has other characters than letters, digits, "_", "." and "-",
-        or the entry is no class or function.
+        or the entry is not a class or function.
 
     Examples:
       >>> from mjx_reinforce import envs

@@ -35,7 +35,7 @@ class _Recorder(View):
     def __getattr__(self, name: str) -> jax.Array:
         shape = getattr(self.sizes, name)
         if not hasattr(shape, "dtype"):
-            raise ValueError(f"the task reads {name}, which is no array of mjData")
+            raise ValueError(f"the task reads {name}, which is not an array of mjData")
         self.read.add(name)
         return jnp.zeros(shape.shape, shape.dtype)
 

@@ -103,7 +103,7 @@ def read_settings(task: object, words: Sequence[str]) -> dict[str, Any]:
     form = getattr(task, "Settings", None)
     if not dataclasses.is_dataclass(form):
         raise ValueError(
-            f"--env-set {' '.join(words)} has no effect on {called}: it is no class with a "
+            f"--env-set {' '.join(words)} has no effect on {called}: it is not a class with a "
             "dataclass Settings, as MujocoEnv has"
         )
     kinds = typing.get_type_hints(form)

@@ -155,7 +155,7 @@ def read_arrays(path: Path, *, stored: bool = False) -> Arrays:
     except Exception as error:  # what zip and NumPy raise has no common class
         # NumPy's second sentence proposes to trust a pickle.
         reason = f"{type(error).__name__}: {error}".splitlines()[0].partition(". ")[0]
-        raise ValueError(f"{path} is damaged: it is no whole NumPy archive ({reason})") from error
+        raise ValueError(f"{path} is damaged: not a whole NumPy archive ({reason})") from error
 
 
 def check_stored(archive: Path | IO[bytes]) -> None:

@@ -43,7 +43,7 @@ def write_class(settings: NewSettings) -> None:
     xml = settings.model
     output = settings.output or xml.with_name(f"{re.sub(r'[^0-9a-zA-Z]+', '_', xml.stem)}.py")
     if xml.suffix.lower() != ".xml":
-        raise ValueError(f"{xml} is no model; give an MJCF file that ends in .xml")
+        raise ValueError(f"{xml} is not a model; give an MJCF file that ends in .xml")
     check_module(output, "my_robot.py")
     if output.parent.resolve() != xml.parent.resolve():
         raise ValueError(f"{output} must be in the folder of {xml}, where it looks for the model")

@@ -114,7 +114,7 @@ def load_own(kind: str, name: str, *, form: str = "module:name") -> Callable[...
       form: what is called so, for messages.
 
     Raises:
-      ValueError: it cannot be imported, or is no class or function.
+      ValueError: it cannot be imported, or is not a class or function.
     """
     if not {"", os.getcwd()} & set(sys.path):  # python -m has it, a script has not
         sys.path.insert(0, os.getcwd())
@@ -127,7 +127,7 @@ def load_own(kind: str, name: str, *, form: str = "module:name") -> Callable[...
         ) from error
     if not callable(made):
         raise ValueError(
-            f"the {kind} {name!r} is no class or function, but of type {type(made).__name__}; "
+            f"the {kind} {name!r} is not a class or function, but of type {type(made).__name__}; "
             f"write {form}"
         )
     return made

@@ -199,12 +199,12 @@ def check_parts(env: object) -> None:
     """Raises ValueError for an object that has not the methods of an environment."""
     name = type(env).__name__
     if isinstance(env, type):
-        raise BadEnvironmentError(f"{env.__name__} is a class, no environment yet: call it")
+        raise BadEnvironmentError(f"{env.__name__} is a class, not an environment yet: call it")
     try:
         missing = [part for part in _PARTS if not hasattr(env, part)]
     except Exception as error:  # action_size may be a property, the user's code
         raise BadEnvironmentError(f"{name}.action_size fails: {explain(error)}") from error
-    lacks = f"{name} is no environment: it has no {', '.join(missing)}"
+    lacks = f"{name} is not an environment: it has no {', '.join(missing)}"
     require(not missing, f"{lacks}; mjx_reinforce.Environment says what one has")
 
 

@@ -57,7 +57,7 @@ def read_run(directory: str | Path) -> Run:
     """Reads the config.json of a run directory; the id of a task is its run of the package.
 
     Raises:
-      ValueError: it is no run directory, or it has no policy yet.
+      ValueError: it is not a run directory, or it has no policy yet.
     """
     directory = Path(directory)
     if str(directory) in pretrained() and not directory.exists():
@@ -71,7 +71,7 @@ def read_run(directory: str | Path) -> Run:
                 f"{directory / 'policies' / '000'}"
             )
         raise ValueError(
-            f"{directory} is no run directory: there is no {path}"
+            f"{directory} is not a run directory: there is no {path}"
             f"{'' if directory.is_dir() else _packaged(directory.name)}"
         )
     found: dict[str, Any] = {"seeds": None, "env_set": []} | read_json(path)

@@ -193,7 +193,7 @@ MISTAKES = {
     "train --seeds 3": "'3'; --num-seeds says how many",
     "train --learning-rat=0.1": "--learning-rate FLOAT",
     "train --env-steps 1M": "takes a whole number, such as 4 or 2e6, got '1M'",
-    "watch --output film.avi runs/first": "runs/first is no run directory",
+    "watch --output film.avi runs/first": "runs/first is not a run directory",
     "sweep": "nothing is swept: give --over a setting and its values, such as --over learning-rate",
     "sweep --over learning-rat 1 2": "Did you mean 'learning-rate'?",
     "report": "there is nothing to report on: name a run or a sweep directory",

@@ -108,7 +108,7 @@ def test_a_walker_starts_in_its_key_frame(tmp_path, monkeypatch):
 
 WRONG = {
     "nothing.xml": "there is no model",
-    "model.urdf": "model.urdf is no model; give an MJCF file that ends in .xml",
+    "model.urdf": "model.urdf is not a model; give an MJCF file that ends in .xml",
     "arm.xml --output json.py": "cannot import 'json.py' beside",
     "arm.xml --output my-arm.py": "Python cannot import 'my-arm.py'",
     "arm.xml --output ../arm.py": "must be in the folder of arm.xml",

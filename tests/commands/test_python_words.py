@@ -72,7 +72,7 @@ def test_a_learner_is_refused(message, monkeypatch):
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: m.reinforce(Survive), "Survive is a class, no environment yet: call it"),
+        (lambda: m.reinforce(Survive), "Survive is a class, not an environment yet: call it"),
         (lambda: m.ars(ENV, policy=m.mlp_policy(3, NORMAL)), "policy.apply"),
         (lambda: m.ars(ENV, num_directions=True), "num_directions must be a whole number, got T"),
         (lambda: m.ars(ENV, num_directions=2.5), "num_directions must be a whole number.* got 2.5"),

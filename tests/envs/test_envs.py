@@ -284,7 +284,7 @@ def test_what_is_no_setting_is_refused(words, said):
 
 
 def test_what_has_no_settings_is_refused():
-    with pytest.raises(ValueError, match="no class with a dataclass Settings"):
+    with pytest.raises(ValueError, match="not a class with a dataclass Settings"):
         read_settings(len, ["weight=1"])
 
 

@@ -54,7 +54,7 @@ def test_there_is_one_policy_of_a_task_by_its_name():
     for options in ({"seed": 1}, {"seed": "worst"}, {"which": "best"}):
         with pytest.raises(ValueError, match="one policy for HalfCheetah-v5"):
             load("HalfCheetah-v5", **options)
-    with pytest.raises(ValueError, match=r"HalfCheeta-v5 is no run .* mean 'HalfCheetah-v5'"):
+    with pytest.raises(ValueError, match=r"HalfCheeta-v5 is not a run .* mean 'HalfCheetah-v5'"):
         load("HalfCheeta-v5")
 
 

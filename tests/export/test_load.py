@@ -152,7 +152,7 @@ def pack(run):
 JSON, NPZ = "policy/policy.json", "policy/actor.npz"
 #: What is done to a run, the file that the message names, and what it says besides.
 DAMAGE = {
-    "no run": (remove("config.json"), "config.json", "is no run directory"),
+    "no run": (remove("config.json"), "config.json", "is not a run directory"),
     "config is no JSON": (content("config.json", b"["), "config.json", "is damaged"),
     "huge horizon": (entries("config.json", horizon=10**12), "config.json", "from 1 to 2^31 - 1"),
     "env is no text": (entries("config.json", env=None), "config.json", "env must be text"),
@@ -169,11 +169,11 @@ DAMAGE = {
     "no sizes": (signed(hidden_sizes=...), JSON, "hidden_sizes is missing"),
     "another scaling": (entries(JSON, rescale=False), "policy.json", "checksum"),
     "no arrays": (remove(NPZ), NPZ, "cannot read"),
-    "half an archive": (cut, NPZ, "no whole NumPy archive"),
+    "half an archive": (cut, NPZ, "not a whole NumPy archive"),
     "objects": (
         arrays(sign=False, normalizer__mean=as_objects),
         NPZ,
-        "no whole NumPy archive",
+        "not a whole NumPy archive",
     ),
     "nan": (arrays(**{KERNEL: lambda x: x * np.nan}), NPZ, "seed 1 has numbers that are not"),
     "other numbers": (

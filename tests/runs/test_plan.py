@@ -1,4 +1,4 @@
-"""What a run says before it starts: its defaults, its memory, its signs of life."""
+"""What a run says before it starts: its defaults, its memory."""
 
 import csv
 import dataclasses

@@ -97,6 +97,6 @@ def test_what_makes_no_sense_is_refused(tmp_path):
 def test_a_run_to_begin_from_is_looked_for_before_anything_is_compiled(tmp_path, monkeypatch):
     monkeypatch.setattr("mjx_reinforce.runs.conduct.compile_slots", pytest.fail)
     wanted = dataclasses.replace(CONFIG, init_from=str(tmp_path / "nowhere"))
-    with pytest.raises(ValueError, match="is no run directory"):
+    with pytest.raises(ValueError, match="is not a run directory"):
         mjx_reinforce.run(wanted, output=tmp_path / "new", quiet=True)
     assert [*tmp_path.iterdir()] == []

@@ -94,7 +94,7 @@ def mine(tmp_path, monkeypatch):
         ({"algorithm": "mine:forgetful"}, "must also return the metrics episodes, episode_return"),
         ({"algorithm": "mine:shapeless"}, "must return a state of the structure, shapes and"),
         ({"estimator": "mine:absent"}, "cannot import the estimator 'mine:absent'"),
-        ({"policy": "mine:one"}, "the policy 'mine:one' is no class or function, but of type int"),
+        ({"policy": "mine:one"}, "'mine:one' is not a class or function, but of type int"),
         ({"algorithm": "nowhere:one"}, "cannot import the algorithm 'nowhere:one'.*this folder"),
     ],
 )
