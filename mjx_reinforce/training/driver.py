@@ -233,9 +233,14 @@ class Driver(Training):
         return super().checkpoint()._replace(best=StateRows(self.best).rows(self.best))
 
     def drive(self, interrupted: Callable[[], bool]) -> None:
-        """Trains as any runs; what was made before an observer's end is evaluated."""
+        """Trains as any runs; first, and where an observer ends them, they are evaluated alone.
+
+        So that the first line is seen at once, where a block of updates takes half a minute.
+        """
+        if not self.record.begun():
+            self._take([self.slots.evaluate()])
         super().drive(interrupted)
-        if not self.record.is_evaluated() and (self.ended or not self.record.begun()):
+        if self.ended and not self.record.is_evaluated():
             self._take([self.slots.evaluate()])
 
     def _most(self) -> int:

@@ -90,11 +90,11 @@ def after(number):
     return lambda: next(answers, True)
 
 
-def test_policies_are_evaluated_with_the_updates_that_follow_and_the_last_alone():
+def test_the_first_and_the_last_policies_are_evaluated_alone_and_others_with_the_next_updates():
     steps, diary = Steps(), Diary()
     driver = driver_of(steps, diary)
     driver.drive(never)
-    assert steps.looks == [True, True, True]
+    assert steps.looks == [False, True, True]
     assert diary.notes == [
         *("evaluated 0", "updated 2", "evaluated 2", "updated 4", "evaluated 4", "updated 6"),
         "evaluated 6",
