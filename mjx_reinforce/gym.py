@@ -61,6 +61,6 @@ def make(
 def only_many(env: str, **options: object) -> gymnasium.Env:
     """Raises ValueError: Gymnasium's ``make`` asks for one environment."""
     raise ValueError(
-        f"these are many at once: gymnasium.make_vec('mjx_reinforce/{env}', num_envs=...); one of "
-        f"Gymnasium's own is gymnasium.make('{env}')"
+        f"many play at once here: use gymnasium.make_vec('mjx_reinforce/{env}', num_envs=...); for "
+        f"one of Gymnasium's own, use gymnasium.make('{env}')"
     )

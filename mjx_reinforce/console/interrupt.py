@@ -97,7 +97,7 @@ class Interrupt:
         if self.number is not None:
             self.leave(128 + number)
         self.number = number
-        said = "stopping after the present block of updates or test; Ctrl-C again stops at once"
+        said = "stopping after the current block of updates or test; Ctrl-C again stops at once"
         _start_thread(functools.partial(self._say, said))
 
 

@@ -22,7 +22,7 @@ Which = Literal["last", "best"]
 _PLACES = {"last": ("policy", "final_returns"), "best": ("policy/best", "best_test_returns")}
 #: The entries of config.json that are read, and their types.
 _KINDS = {"env": str, "horizon": int, "seeds": tuple[int, ...] | None, "env_set": tuple[str, ...]}
-_NOT_YET = "its training goes on, or was killed, and then train --resume goes on with it"
+_NOT_YET = "its training is still running, or was killed: train --resume continues it"
 
 
 class Run(NamedTuple):

@@ -68,8 +68,7 @@ def read_experiment(sources: Sequence[Path]) -> Experiment:
     if len(envs) > 1:
         raise ValueError(
             f"these are of different tasks ({', '.join(envs)}), whose returns cannot be compared; "
-            "make a page of each task, and a table and a figure of all with "
-            "experiments/examples/all_tasks.py"
+            "make one page per task, or compare tasks by experiments/examples/all_tasks.py"
         )
     joined = _join_shares(found)
     configurations = _told_apart(joined)
@@ -77,7 +76,7 @@ def read_experiment(sources: Sequence[Path]) -> Experiment:
         if not np.intersect1d(configurations[0].seed, other.seed).size:
             raise ValueError(
                 f"{configurations[0].label} and {other.label} have no seed in common, so they "
-                "cannot be compared; give equal --seeds, or the settings of one run"
+                "cannot be compared; train both with the same --seeds"
             )
     thresholds = [source.threshold for source in found if source.threshold is not None]
     provenance, disagree = _merge_provenance(found)
@@ -127,7 +126,7 @@ def _join_parts(parts: Sequence[Configuration]) -> Configuration:
     if len(order) < len(where):
         raise ValueError(
             f"{' and '.join(map(str, dict.fromkeys(where)))} have seed {seed[times.argmax()]} in "
-            "common, with equal settings: give each share other --seeds, or leave one of them out"
+            "common, with equal settings: give each share its own --seeds, or leave one out"
         )
 
     def together(name: str) -> np.ndarray:

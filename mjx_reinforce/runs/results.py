@@ -114,7 +114,7 @@ def run(
         ``dataclasses.replace``.
       output: the directory of the run's files. None, with ``config.output`` None too, writes none.
       observers: functions that are called with each evaluation. One that returns a true value
-        ends the run after the present block of updates.
+        ends the run after the current block of updates.
       quiet: show no progress.
 
     Returns:

@@ -191,7 +191,7 @@ def test_a_second_signal_ends_at_once(tmp_path):
     time.sleep(0.5)
     process.send_signal(signal.SIGINT)
     assert process.poll() is None
-    assert any("stopping after the present block" in line for line in process.stdout)
+    assert any("stopping after the current block" in line for line in process.stdout)
     process.send_signal(signal.SIGINT)
     begun = time.monotonic()
     assert finish(process) == 130
