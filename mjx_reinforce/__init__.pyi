@@ -42,8 +42,8 @@ from mjx_reinforce.statistics.comparisons import (
     probability_of_improvement,
 )
 from mjx_reinforce.statistics.survival import kaplan_meier, log_rank
-from mjx_reinforce.training.block import evaluate
 from mjx_reinforce.training.driver import Evaluation
+from mjx_reinforce.training.programs import evaluate
 
 from . import console as console
 from . import engine as engine

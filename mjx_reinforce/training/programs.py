@@ -1,4 +1,7 @@
-"""The programs that move runs on side by side; ``slots`` compiles them."""
+"""The programs that move runs on side by side; ``slots`` compiles them.
+
+They make a block of updates, and evaluate policies.
+"""
 
 import dataclasses
 import functools
@@ -8,21 +11,198 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
-from mjx_reinforce.engine.base import Environment, plain
+from mjx_reinforce.engine.base import Environment, Trajectory, plain
+from mjx_reinforce.engine.play.episode import episode_keys
+from mjx_reinforce.engine.play.rollouts import episode_lengths, episode_returns
 from mjx_reinforce.learning import counts
-from mjx_reinforce.learning.learner import TrainState
+from mjx_reinforce.learning.learner import Learner, TrainState
+from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import MAX_COUNT, Config
-from mjx_reinforce.training import state
-from mjx_reinforce.training.block import (
-    BuildLearner,
-    block_of_updates,
-    evaluate,
-    evaluation_episodes,
-)
 from mjx_reinforce.training.division import ALONE, Division
-from mjx_reinforce.training.state import Budget, RunState, Seed, StateRows
-from mjx_reinforce.training.wrappers import SharedLaunch
+from mjx_reinforce.training.state import (
+    Budget,
+    RunState,
+    Seed,
+    StateRows,
+    eval_keys,
+    last_test_keys,
+    seed_keys,
+)
+from mjx_reinforce.training.wrappers import EvaluationEpisodes, SharedLaunch, step_with
+
+#: Returns the learner of settings that may be traced, of one run each.
+BuildLearner = Callable[[dict[str, jax.Array]], Learner]
+
+
+class Block(NamedTuple):
+    """What a block of updates measured.
+
+    made: [] how many updates were made
+    metrics: [length, R] each; the rows after the last update are zero
+    looked: [R] each, what ``measure`` returns of the policies before the first update;
+      empty where the evaluation does not ride with it
+    """
+
+    made: jax.Array
+    metrics: dict[str, jax.Array]
+    looked: dict[str, jax.Array]
+
+
+def block_of_updates(
+    build_learner: BuildLearner, length: int, visit: Callable[..., EvaluationEpisodes] | None
+) -> Callable[..., tuple[RunState, Block]]:
+    """Returns a function that makes ``length`` updates of all runs, or fewer if that is the end.
+
+    It takes a ``RunState``, a ``Budget``, and whether to evaluate the policies before the first
+    update, [] or [R]. Its result is the state, and a ``Block``.
+
+    Args:
+      build_learner: called while the settings of one run are traced.
+      length: rows of the metrics.
+      visit: (key of an evaluation [], active=whether it is made []) -> its episodes, which are
+        played in one go with those of the first update; None where learners cannot.
+    """
+
+    def active(state: RunState, budget: Budget) -> jax.Array:
+        used = counts.reached(state.train_states.env_steps, budget.env_steps)
+        return ~(used | counts.reached(state.train_states.num_updates, budget.updates))
+
+    def progress(state: RunState, budget: Budget) -> jax.Array:
+        """Returns the share [R] of its budget that each run has used."""
+        env_steps = counts.as_float(state.train_states.env_steps)
+        updates = counts.as_float(state.train_states.num_updates)
+        # No run goes on whose budget is nothing.
+        limits = (counts.as_float(x) for x in budget)
+        one, other = (jnp.maximum(limit, 1.0) for limit in limits)
+        return jnp.minimum(jnp.maximum(env_steps / one, updates / other), 1.0)
+
+    def step(
+        state: TrainState,
+        settings: dict[str, jax.Array],
+        going: jax.Array,
+        eval_key: jax.Array,
+        look: jax.Array,
+    ) -> Any:
+        evaluation = None if visit is None else visit(eval_key, active=look)
+        state, metrics, played = step_with(build_learner(settings), state, going, evaluation)
+        looked = {} if evaluation is None or played is None else measure(played, evaluation)
+        return state, metrics | {"active": going}, looked
+
+    @functools.partial(jax.jit, inline=True)  # traced once, for its shapes and for the loop
+    def update(state: RunState, budget: Budget, look: jax.Array) -> Any:
+        before = dataclasses.replace(state.train_states, progress=progress(state, budget))
+        going, looks = active(state, budget), jnp.broadcast_to(look, len(state.eval_keys))
+        train_states, metrics, looked = jax.vmap(step)(
+            before, state.settings, going, state.eval_keys, looks
+        )
+        return dataclasses.replace(state, train_states=train_states), metrics, looked
+
+    def advance(state: RunState, budget: Budget, look: jax.Array) -> tuple[RunState, Block]:
+        def unfinished(carry: tuple[RunState, Block]) -> jax.Array:
+            state, block = carry
+            return (block.made < length) & jnp.any(active(state, budget))
+
+        def body(carry: tuple[RunState, Block]) -> tuple[RunState, Block]:
+            state, (made, rows, looked) = carry
+            state, row, now = update(state, budget, look & (made == 0))
+            write = functools.partial(lax.dynamic_update_index_in_dim, index=made, axis=0)
+            looked = jax.tree.map(lambda x, old: jnp.where(made == 0, x, old), now, looked)
+            return state, Block(made + 1, jax.tree.map(write, rows, row), looked)
+
+        _, row, looked = jax.eval_shape(update, state, budget, look)
+        zeros = functools.partial(jax.tree.map, lambda x: jnp.zeros(x.shape, x.dtype))
+        rows = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), row)
+        return lax.while_loop(unfinished, body, (state, Block(jnp.int32(0), rows, zeros(looked))))
+
+    return advance
+
+
+def evaluation_episodes(
+    key: jax.Array, *, num_episodes: int, active: bool | jax.Array = True, sampled: bool = True
+) -> EvaluationEpisodes:
+    """Returns the episodes of an evaluation: N with the policy's mode, and N with its samples.
+
+    Args:
+      key: consumed; pass the same one each time to see the same start states, and each seed one of
+        its own: else the choice of the starts is a chance that no interval over seeds covers.
+      num_episodes: N, of each kind.
+      active: [] where False nothing is played, and what was measured says nothing.
+      sampled: whether the second N are played; the first are the same without them.
+    """
+    keys = episode_keys(key, (1 + sampled) * num_episodes)
+    return EvaluationEpisodes(keys, num_episodes, jnp.asarray(active))
+
+
+def evaluate(
+    env: Environment,
+    learner: Learner,
+    actor: Actor,
+    key: jax.Array,
+    *,
+    num_episodes: int,
+    horizon: int,
+    active: bool | jax.Array = True,
+    sampled: bool = True,
+) -> dict[str, jax.Array]:
+    """Plays the episodes of an evaluation alone; returns what ``measure`` does.
+
+    Args:
+      env: what is played.
+      learner: whose policy and engine it is.
+      actor: the parameters and observation statistics.
+      key: as for ``evaluation_episodes``, with the other arguments that are not named here.
+      num_episodes: N, of each kind.
+      horizon: T, the time limit in steps.
+      active: [] where False nothing is played, and what is returned says nothing.
+      sampled: whether the second N are played.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> learner = mr.reinforce(env, num_episodes=4, horizon=20)
+      >>> actor = learner.init(jax.random.key(0)).actor
+      >>> found = mr.evaluate(env, learner, actor, jax.random.key(1), num_episodes=4, horizon=20)
+      >>> 1 <= found["eval_return"].item() <= 20
+      True
+    """
+    evaluation = evaluation_episodes(key, num_episodes=num_episodes, active=active, sampled=sampled)
+    trajectory = learner.engine.rollout(
+        env,
+        learner.act,
+        actor,
+        learner.policy.distribution,
+        evaluation.keys,
+        num_episodes=len(evaluation.keys),
+        horizon=horizon,
+        deterministic=evaluation.deterministic(),
+        active=evaluation.active,
+    )
+    return measure(trajectory, evaluation) | {"simulated_steps": trajectory.simulated}
+
+
+def measure(trajectory: Trajectory, evaluation: EvaluationEpisodes) -> dict[str, jax.Array]:
+    """Returns what the episodes of an evaluation show.
+
+    ``eval_return`` and ``eval_length`` [], means over the deterministic episodes,
+    ``eval_return_stochastic`` [], over the sampled ones if there are any, ``eval_steps`` [], the
+    steps of all episodes, and ``simulated_steps`` [], those that were simulated for them alone:
+    none where they rode with others. A return is NaN if one of its episodes left the finite
+    numbers: what that earned until then says nothing.
+    """
+    returns, lengths = episode_returns(trajectory), episode_lengths(trajectory)
+    returns = jnp.where(trajectory.nonfinite | ~jnp.isfinite(returns), jnp.nan, returns)
+    modes = evaluation.num_modes
+    sampled = len(evaluation.keys) > modes
+    stochastic = {"eval_return_stochastic": jnp.mean(returns[modes:])} if sampled else {}
+    return stochastic | {
+        "eval_return": jnp.mean(returns[:modes]),
+        "eval_length": jnp.mean(lengths[:modes]),
+        "eval_steps": jnp.sum(lengths),
+        "simulated_steps": jnp.zeros((), jnp.int32),
+    }
 
 
 class Programs(NamedTuple):
@@ -34,8 +214,8 @@ class Programs(NamedTuple):
     begin: (seed, the numbers [R] of the runs' seeds, settings [R] each) -> the first states, and
       the data of the keys [K, R] of the last test, which plays the episodes of K evaluations
     advance: (states, the parts of a ``Budget``, which rows have a run [R], whether to evaluate [])
-      -> (states, metrics [K, R] each, what was evaluated [R] each), as in ``block.Block``
-    evaluate: (states, whether to [R]) -> what ``block.evaluate`` returns, [R] each
+      -> (states, metrics [K, R] each, what was evaluated [R] each), as in ``Block``
+    evaluate: (states, whether to [R]) -> what ``evaluate`` returns, [R] each
     rides: whether ``advance`` evaluates; else ``evaluate`` does, before it
     like: the shapes of a ``RunState``
     division: among which devices the runs are divided; R are those of one device
@@ -85,16 +265,16 @@ def programs_of(
 
     # One program, whatever the seeds are: a program for each operation on keys takes longer.
     def states(seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]) -> RunState:
-        keys = state.seed_keys(seed, numbers)
+        keys = seed_keys(seed, numbers)
         return RunState(
             train_states=jax.vmap(first)(keys, settings),
-            eval_keys=state.eval_keys(numbers),
+            eval_keys=eval_keys(numbers),
             settings=settings,
         )
 
     def begin(seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]) -> Any:
         rows = layout.traced_rows(states(seed, numbers, settings))
-        return rows, plain(state.last_test_keys(numbers, config))
+        return rows, plain(last_test_keys(numbers, config))
 
     size: Any = {"num_episodes": config.eval_episodes, "sampled": whole}
     visit = functools.partial(evaluation_episodes, **size)

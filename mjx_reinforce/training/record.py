@@ -21,7 +21,7 @@ class Measured(NamedTuple):
 
     runs: [n] their numbers, the least first
     metrics: [K, n] each, what ``block_of_updates`` measured in at most K updates; empty without any
-    looked: [n] each, what ``block.evaluate`` returns of the policies before; empty without any
+    looked: [n] each, what ``programs.evaluate`` returns of the policies before; empty without any
     """
 
     runs: np.ndarray
@@ -411,7 +411,7 @@ class RunRecord(Record):
         return self.measure(now, seconds[-1], now - fractions[0], seconds[-1] - seconds[0])
 
     def add_test(self, looked: Arrays) -> None:
-        """Counts what an evaluation or a test simulated, of ``block.evaluate``."""
+        """Counts what an evaluation or a test simulated, of ``programs.evaluate``."""
         self.simulated += _sum(looked["simulated_steps"])
         self.evaluated += _sum(looked["eval_steps"])
 

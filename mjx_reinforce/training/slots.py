@@ -90,7 +90,7 @@ class Compiled(NamedTuple):
       and the data of the keys [K, W] of the last test
     advance: (states [W, B], budget, which lanes have a run [W], whether to evaluate []) -> (states
       [W, B], metrics [K, W] each, what was evaluated [W] each, if that rides), as in ``Measured``
-    evaluate: (states [W, B], which [W]) -> what ``block.evaluate`` returns [W] each
+    evaluate: (states [W, B], which [W]) -> what ``programs.evaluate`` returns [W] each
     width: W, the runs of a slot
     programs: that were compiled
     config: the settings of the runs; one of those that differ stands for any value
@@ -212,7 +212,7 @@ class Slots:
         return _of_slots(lanes, _side_by_side(look, lanes))
 
     def test(self, actor: Actor) -> Arrays:
-        """Returns what ``block.evaluate`` does of policies [R, ...], on starts of their own.
+        """Returns what ``programs.evaluate`` does of policies [R, ...], on starts of their own.
 
         There are ``test_episodes`` of them, rounded up to whole evaluations.
         """

@@ -15,7 +15,7 @@ from mjx_reinforce.runs import display
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import summarize
 from mjx_reinforce.training import record as measured
-from mjx_reinforce.training.block import evaluate
+from mjx_reinforce.training.programs import evaluate
 from mjx_reinforce.training.record import Measured, Progress, RunRecord
 
 

@@ -7,7 +7,7 @@ import pytest
 from flax import struct
 
 from mjx_reinforce.learning import counts
-from mjx_reinforce.training import block
+from mjx_reinforce.training import programs
 from mjx_reinforce.training.state import Budget, RunState
 
 
@@ -41,8 +41,8 @@ def advance(monkeypatch):
     """Runs a block of 4 updates of runs that play so many env steps an update, of a budget."""
 
     def run(each, budget, look=False, visit=None, begun=0):
-        monkeypatch.setattr(block, "measure", lambda played, evaluation: {"seen": evaluation})
-        monkeypatch.setattr(block, "step_with", Counter.step_with)
+        monkeypatch.setattr(programs, "measure", lambda played, evaluation: {"seen": evaluation})
+        monkeypatch.setattr(programs, "step_with", Counter.step_with)
         num = len(each)
         none = jnp.stack([jnp.asarray(counts.from_int(begun))] * num)
         states = RunState(
@@ -50,7 +50,7 @@ def advance(monkeypatch):
             eval_keys=jax.random.split(jax.random.key(0), num),
             settings={"each": jnp.array(each)},
         )
-        made = jax.jit(block.block_of_updates(Counter, 4, visit))
+        made = jax.jit(programs.block_of_updates(Counter, 4, visit))
         after, result = made(states, budget, jnp.asarray(look))
         return counts.to_int(after.train_states.num_updates).tolist(), result
 
