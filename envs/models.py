@@ -34,10 +34,6 @@ NOT_CARRIED = {
     "plugin": ("nplugin", "plugins", "remove them"),
     "plastic": ("nplastic", "plastic springs", "remove springyield"),
 }
-_OFF = (
-    *(_C.mjtDisableBit.mjDSBL_CONSTRAINT, _C.mjtDisableBit.mjDSBL_CONTACT),
-    _C.mjtDisableBit.mjDSBL_EQUALITY,
-)
 _HOLDS = (int(_C.mjtEq.mjEQ_CONNECT), int(_C.mjtEq.mjEQ_WELD))
 _WITHIN_MARGIN = "give it a margin of at most half of its range"
 _ON_JOINT = "give it to the joint, times the square of gear"
@@ -46,7 +42,6 @@ _ONE_SIGN = "give two positive numbers, or two that are not"
 _RISING = "give a second number that is not below it, and a width above zero"
 #: Fields of a model that say how soft its constraints are.
 _SOFT = ("dof_{}", "eq_{}", "geom_{}", "jnt_{}", "pair_{}", "tendon_{}_lim", "tendon_{}_fri")
-_NO_WIDTH = 1e-15  # mjMINVAL
 #: What else MJX ignores in silence.
 _IGNORED = (
     ("actuator_armature", "the armature of an actuator", _ON_JOINT),
@@ -60,6 +55,7 @@ _IGNORED = (
     ("geom_adhesion", "adhesive geoms", "remove adhesion"),
     ("pair_adhesion", "adhesive contact pairs", "remove adhesion"),
     ("geom_surfacevel", "moving surfaces", "remove surfacevel"),
+    ("geom_fluid", "the fluid forces on ellipsoids", "remove fluidshape"),
 )
 #: Part of MJX's message -> what to change in the MJCF.
 _REMEDIES = {
@@ -209,6 +205,11 @@ def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
     return converted
 
 
+def _is_off(model: MjModel, flag: str) -> bool:
+    """Returns whether a flag of <option> is disabled."""
+    return bool(model.opt.disableflags & getattr(_C.mjtDisableBit, f"mjDSBL_{flag.upper()}"))
+
+
 def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
     """Yields what MJX would ignore in silence, and how to do without it."""
     for field, feature, remedy in (*NOT_CARRIED.values(), *_IGNORED):
@@ -226,23 +227,25 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
         low, high, width = getattr(model, of.format("solimp"))[:, :3].T
         if np.any((ref[:, 0] > 0) != (ref[:, 1] > 0)):
             yield "MuJoCo's default in place of a solref of mixed signs", _ONE_SIGN
-        if np.any((low > high) | ((width < _NO_WIDTH) & (low != high))):
+        if np.any((low > high) | ((width < 1e-15) & (low != high))):  # mjMINVAL
             yield "the first number of a solimp that does not rise", _RISING
     if model.opt.enableflags & _C.mjtEnableBit.mjENBL_SLEEP:
         yield "sleeping bodies", 'remove <flag sleep="enable"/>'
+    if model.opt.noslip_iterations:
+        yield "noslip_iterations", "remove it"
     if model.opt.disableactuator:
         yield "disabled groups of actuators", "remove actuatorgroupdisable, or those actuators"
     for flag, values in (("spring", "stiffness"), ("damper", "damping")):
-        if model.opt.disableflags & getattr(_C.mjtDisableBit, f"mjDSBL_{flag.upper()}"):
+        if _is_off(model, flag):
             yield f'parts of <flag {flag}="disable"/>', f"remove it, and give no {values}"
     for flag in ("nativeccd", "multiccd"):
-        if model.opt.disableflags & getattr(_C.mjtDisableBit, f"mjDSBL_{flag.upper()}"):
+        if _is_off(model, flag):
             yield f'<flag {flag}="disable"/>', "remove it"
     # MJX adds up the forces on a body of rows that are not there.
-    off = [bool(model.opt.disableflags & bit) for bit in _OFF]
-    if off[0] and not off[1] and any(geom_pairs(model)):
+    constraint = _is_off(model, "constraint")
+    if constraint and not _is_off(model, "contact") and any(geom_pairs(model)):
         yield '<flag constraint="disable"/> for contacts', 'add contact="disable" to it'
-    if (off[0] or off[2]) and np.isin(model.eq_type, _HOLDS).any():
+    if (constraint or _is_off(model, "equality")) and np.isin(model.eq_type, _HOLDS).any():
         yield '<flag equality="disable"/> for a connect or a weld', 'give it active="false"'
     if model.opt.integrator == _C.mjtIntegrator.mjINT_DISCRETE:
         yield "the integrator INT_DISCRETE", _REMEDIES["INT_IMPLICIT"]

@@ -15,7 +15,7 @@ from experiments.checks.mechanisms import mechanisms
 ALL = list(mechanisms())
 #: What MJX computes without us, under an option each; flags, cones and pairs of geoms, which
 #: tests/engine/physics compares. ``matrix`` itself has all.
-MJXS = ("CG", "noslip", "energy", "wind")
+MJXS = ("CG", "energy", "wind")
 CHOSEN = [
     each
     for each in ALL

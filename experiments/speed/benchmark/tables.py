@@ -91,9 +91,10 @@ def origin(rows: list[dict[str, Any]]) -> str:
     def every(key: str) -> str:
         return listed(dict.fromkeys(row[key] for row in rows))
 
-    devices = every("device") if any(row["device"] != "cpu" for row in rows) else "CPU alone"
+    cards = dict.fromkeys(row["device"] for row in rows if row["device"] != "cpu")
     commits = listed(dict.fromkeys(row["commit"][:8] or "not noted" for row in rows))
-    line = f"{devices}; {every('machine')}; JAX {every('jax')}; calls of {every('date')}"
+    days = listed(dict.fromkeys(row["date"][:10] for row in rows))
+    line = f"{listed(cards or ['CPU alone'])}; {every('machine')}; JAX {every('jax')}; {days}"
     return f"{line}; commit {commits}."
 
 
@@ -132,7 +133,7 @@ def words(raw: Raw) -> str:
         equal.append((task, double, c_mujoco))
     return textwrap.fill(
         f"On two cores `native` plays the first six tasks at {span('the speed of C MuJoCo', equal)}"
-        f" in equal precision. In float32, in which it trains, that is {span('its speed', single)}."
+        f" in equal precision. In float32, used for training, it is {span('its speed', single)}."
         f" On the GPU it is {span('the speed of MuJoCo Warp', warp)}.",
         110,
     )
@@ -142,16 +143,14 @@ def gpu(raw: Raw) -> str:
     """All tasks on a GPU."""
     rows = []
     for task in tasks_of(raw.gpu):
-        native, warp = best(raw.gpu, task, "native"), best(raw.gpu, task, "MuJoCo Warp")
-        plain, c_mujoco = best(raw.gpu, task, "plain MJX"), best(raw.gpu, task, "C MuJoCo")
+        native, warp, plain = (
+            best(raw.gpu, task, engine) for engine in ("native", "MuJoCo Warp", "plain MJX")
+        )
         card = "" if native is None else native["device"].split()[1]
-        cells = (task.rpartition(":")[2], card, rate(native), at(native), rate(warp), at(warp))
-        rows.append((*cells, ratio(native, warp), rate(plain), at(plain), rate(c_mujoco)))
-    header = (
-        *("task", "on", "native", "episodes x steps", "MuJoCo Warp", "worlds x steps"),
-        *("native / Warp", "plain MJX", "its episodes x steps", "C MuJoCo, all threads, float64"),
-    )
-    return f"{origin(raw.gpu)}\n\n{table(header, rows)}"
+        cells = (task.rpartition(":")[2], card, rate(native), at(native), rate(warp), rate(plain))
+        rows.append((*cells, ratio(native, warp)))
+    header = ("task", "on", "native", "episodes x steps", "MuJoCo Warp", "plain MJX")
+    return f"{origin(raw.gpu)}\n\n{table((*header, 'native / Warp'), rows)}"
 
 
 def cpu(raw: Raw) -> str:
