@@ -293,7 +293,7 @@ for line in sys.stdin:
 """
 UNREACHABLE = {
     "train --output closed/run": "cannot write to the run directory closed/run (Permission",
-    "train --output circle": "directory circle (File exists)",
+    "train --output circle": "directory circle (Too many levels of symbolic links)",
     "train --output circle/run": "directory circle/run (Too many levels of symbolic links)",
     "sweep --over discount 1 0.9 --output closed/run": "closed/run (Permission",
     "train --resume closed/run": "closed/run/config.json (Permission denied)",

@@ -299,12 +299,6 @@ def test_a_folder_in_which_another_is_quicker_stays(run, tmp_path, monkeypatch, 
     assert [path.name for path in (tmp_path / "out/in").iterdir()] == ["config.json"]
 
 
-def test_a_link_in_a_circle_is_no_directory(run, tmp_path, capsys):
-    (tmp_path / "one").symlink_to("one")
-    assert run("--output", "one") == 2
-    assert "directory one (Too many levels of symbolic links)" in capsys.readouterr().err
-
-
 def test_a_finished_run_has_nothing_to_do(run, trained, tmp_path, capsys):
     shutil.copytree(trained, tmp_path / "out")
     before = (tmp_path / "out" / "summary.json").read_bytes()
