@@ -45,6 +45,8 @@ def main() -> None:
 
 def _report(settings: ReportSettings) -> None:
     """Writes a report, and says where it is."""
+    if settings.output is not None:
+        check_page(settings.output, settings.overwrite)
     experiment = sources.read_experiment(settings.sources)
     output = settings.output or _default_output(settings.sources)
     check_page(output, settings.overwrite)

@@ -293,7 +293,7 @@ class SweepFiles(Files[Training]):
 
     def has(self, chunk: str) -> bool:
         """Returns whether the runs of a chunk have ended."""
-        return self._path(chunk).exists()
+        return (self._parts / f"{chunk}.npz").exists()
 
     def began(self, driver: Training) -> None:
         """Takes a chunk to its newest checkpoint, if there is one."""
@@ -329,9 +329,6 @@ class SweepFiles(Files[Training]):
         """Returns the folder of a chunk's checkpoints."""
         return self._parts / driver.runs.name
 
-    def _path(self, chunk: str) -> Path:
-        return self._parts / f"{chunk}.npz"
-
     def _write_part(self, driver: Training) -> None:
         """Writes what a chunk measured, and the last policies of each configuration's ends."""
         record, runs = driver.record, driver.runs
@@ -342,7 +339,7 @@ class SweepFiles(Files[Training]):
         kept = np.concatenate([_ends(last, n) for n in np.unique(runs.configuration)])
         last |= arrays_of(driver.slots.states().train_states.actor)
         ends = {f"ends/{name}": np.asarray(x)[kept] for name, x in last.items()}
-        write_arrays(self._path(runs.name), curves | ends)
+        write_arrays(self._parts / f"{runs.name}.npz", curves | ends)
 
     def _write_policies(self, part: Part, chunks: Sequence[Arrays]) -> None:
         """Writes the policies of the worst and the best seed of each configuration of a group.
