@@ -62,16 +62,12 @@ def explain(error: BaseException) -> str:
     message = " ".join(str(error).split())
     message = message if len(message) <= _LENGTH else f"{message[:_LENGTH]} ..."
     said = f"{type(error).__name__}: {message}" if message else type(error).__name__
-    own = [
-        frame
-        for frame in traceback.extract_tb(error.__traceback__)
-        if not frame.filename.startswith("<") and not _in_library(Path(frame.filename).resolve())
-    ]
-    return f"{said} ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else said
-
-
-def _in_library(file: Path) -> bool:
-    return any(file.is_relative_to(folder) for folder in _LIBRARIES)
+    own = ""
+    for frame in traceback.extract_tb(error.__traceback__):
+        file = Path(frame.filename).resolve()
+        if not frame.filename.startswith("<") and not any(map(file.is_relative_to, _LIBRARIES)):
+            own = f" ({file.name}, line {frame.lineno})"
+    return said + own
 
 
 def check_type(name: str, value: object, kind: object) -> None:

@@ -128,7 +128,7 @@ def _ahead(findings: Findings) -> Iterator[str]:
 
 def _listed(names: list[str]) -> str:
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return ", ".join(f'"{name}"' for name in names[:3]) + more
+    return ", ".join(names[:3]) + more
 
 
 def _solving(findings: Findings) -> Iterator[str]:

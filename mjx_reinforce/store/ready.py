@@ -12,6 +12,7 @@ import functools
 import hashlib
 import importlib
 import json
+import warnings
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
@@ -124,7 +125,8 @@ def made(
         if config.algorithm != "reinforce":
             return build(env, dataclasses.replace(config, **settings))[0]
         # How REINFORCE plays depends on no traced number, and takes a second to write out.
-        other = build(env, dataclasses.replace(config, engine="vmap", **settings))[0]
+        with warnings.catch_warnings(action="ignore"):  # this engine does not play
+            other = build(env, dataclasses.replace(config, engine="vmap", **settings))[0]
         return learner._replace(init=other.init, learn=other.learn)
 
     @functools.cache

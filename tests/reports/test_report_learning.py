@@ -65,8 +65,8 @@ def test_what_is_surely_slower_is_named_where_two_are_equally_fast(tmp_path):
     directory = make_sweep(tmp_path / "sweep", num_seeds=24, over=RATES)
     all_solve(directory, [6, 2, 2])
     said = words.headline(findings_of(directory))
-    slower = 'faster than "learning rate 0.001"'
-    assert said[0] == f"learning rate 0.01 is surely {slower}. The final returns are a tie."
+    faster = "learning rate 0.01 is surely faster than learning rate 0.001"
+    assert said[0] == f"{faster}. The final returns are a tie."
 
 
 def test_nobody_solves_it_is_no_race(tmp_path):
