@@ -1,9 +1,10 @@
 # %% [markdown]
 # # PPO on the engine
 #
-# The simulator is not tied to REINFORCE. `make_vec` gives many environments, `unroll` plays a segment of them in one
+# The simulator is not tied to REINFORCE. `make_vec` gives many environments, `unroll` plays a segment of each in one
 # call of machine code, and the rest is yours. This is PPO (Schulman et al. 2017) with its whole training in one
-# compiled program. `experiments/examples/ppo.py` in the repository is the larger one, with normalized observations and rewards.
+# compiled program. `experiments/examples/ppo.py` in the repository is a larger program, with normalized observations
+# and rewards.
 
 # %%
 import time
@@ -52,8 +53,8 @@ def act(params, observation):
 # %% [markdown]
 # ## Advantages
 #
-# GAE (Schulman et al. 2016) adds up errors of the value, backwards in time. Where the task ended the episode, nothing
-# follows. Where the time limit did, the value of the next observation still counts.
+# GAE (Schulman et al. 2016) adds up errors of the value, backward in time. If the task ended the episode, nothing
+# follows. If the time limit ended the episode, the value of the next observation still counts.
 
 
 # %%
@@ -135,8 +136,8 @@ fig.savefig("ppo.png", dpi=90)
 # %% [markdown]
 # ## To try
 #
-# 1. `make_vec("Hopper-v5", 128)`, with more steps. Normalize observations: the larger program does.
+# 1. `make_vec("Hopper-v5", 128)`, with more steps. Normalize observations, as the larger program does.
 # 2. Train the seeds side by side: `jax.vmap(train)(keys)`.
-# 3. Replace the value by nothing and the segments by whole episodes (`rollout`). What is left is REINFORCE.
+# 3. Remove the value, and play whole episodes (`rollout`) instead of segments. What is left is REINFORCE.
 #
 # [The engine as an environment](../vector.md) has all details.

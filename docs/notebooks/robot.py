@@ -2,7 +2,7 @@
 # # Your own robot
 #
 # A robot is a MuJoCo model. A task is a class that says how an episode starts and what the reward is. This arm has two
-# joints and learns to bring its tip to a target that is somewhere else in each episode.
+# joints and learns to bring its tip to a target. Each episode has a different target.
 
 # %%
 import dataclasses
@@ -74,7 +74,7 @@ class Arm(MujocoEnv):
 # %% [markdown]
 # ## Train
 #
-# `of_task` has settings for tasks that nobody tuned. More episodes in each update make the gradient less noisy.
+# `of_task` returns settings that suit untuned tasks. More episodes in each update make the gradient less noisy.
 #
 # The class has a name in `envs`, so that `run` finds it. On the command line it would be `--env my_module:Arm`.
 
@@ -128,6 +128,6 @@ print(f"median distance at the end: {100 * np.median(distance[-1]):.1f} cm")
 #
 # 1. Your own MJCF: `xml_file="my_robot.xml"`. `python -m mjx_reinforce.new my_robot.xml` begins the class.
 # 2. Let the mass vary: `randomize` may also return `{"body_mass": self.model.body_mass * factor}`.
-# 3. A video: `python -m mjx_reinforce.watch RUN --env my_module:Arm`, of a run that `run(config, output="RUN")` wrote.
+# 3. A video: `python -m mjx_reinforce.watch RUN --env my_module:Arm`, for a run that `run(config, output="RUN")` wrote.
 #
-# [Your own environment](../own_task.md) says what models may have, and what is refused.
+# [Your own environment](../own_task.md) says which parts a model may have, and which are refused.

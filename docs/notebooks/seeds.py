@@ -2,8 +2,8 @@
 # # A thousand seeds, and what three would have said
 #
 # Many papers compare two algorithms over three or five seeds. How often does such a comparison name the wrong winner?
-# We train 1,000 seeds of two configurations. Then we draw three seeds of each, many times, as if they were all that we
-# had.
+# We train 1,000 seeds of each of two configurations. Then we draw three seeds of each, many times, as if they were all
+# that we had.
 
 # %%
 import dataclasses
@@ -40,7 +40,7 @@ winner = int(returns[1].mean() > returns[0].mean())
 # %% [markdown]
 # ## What few seeds would have said
 #
-# Draw n seeds of each, 20,000 times. The winner is the configuration with the higher mean.
+# Draw n seeds of each configuration, 20,000 times. The winner is the configuration with the higher mean.
 
 # %%
 rng = np.random.default_rng(0)
@@ -71,4 +71,4 @@ fig.savefig("seeds.png", dpi=90)
 # 1. Compare medians in place of means.
 # 2. Draw the *same* seeds for both configurations: does pairing help?
 # 3. Sweep `learning_rate` in place of `discount`, or three values of both.
-# 4. `python -m mjx_reinforce.sweep ... --output rates` writes a page that says all of this, and more.
+# 4. `python -m mjx_reinforce.sweep ... --output rates` writes a page with all of this, and more.

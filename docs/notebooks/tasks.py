@@ -2,7 +2,7 @@
 # # A minute on each task
 #
 # By default, a task trains for about a minute on two cores or on a GPU; easy tasks need less. Here each task trains two
-# seeds. The time for compiling comes on top.
+# seeds. Compiling takes extra time.
 
 # %%
 import time

@@ -86,7 +86,7 @@ def _heavy(random: np.random.Generator, shape: tuple[int, int]) -> tuple[np.ndar
     return random.standard_t(3, shape) + 1, random.standard_t(3, shape)
 
 
-PAIRS = {"normal, same luck": _one_luck, "solved or not": _solved_twice, "heavy tail": _heavy}
+PAIRS = {"normal, correlated": _one_luck, "solved or not": _solved_twice, "heavy tail": _heavy}
 
 
 def two_samples(draws: int) -> Iterator[tuple[str, str, list[str]]]:
@@ -116,7 +116,7 @@ def two_samples(draws: int) -> Iterator[tuple[str, str, list[str]]]:
 def paired_rates(draws: int) -> Iterator[tuple[str, str, list[str]]]:
     """Yields the same for the difference of two rates on the same seeds."""
     for first, second, alike in ((0.9, 0.7, 0.5), (0.99, 0.97, 0.5), (1.0, 0.995, 0.0)):
-        name = f"{100 * first:g}% and {100 * second:g}%" + (", same luck" if alike else "")
+        name = f"{100 * first:g}% and {100 * second:g}%" + (", correlated" if alike else "")
         cells = []
         for num_seeds in SEEDS:
             random = np.random.default_rng(num_seeds)
@@ -131,9 +131,9 @@ def paired_rates(draws: int) -> Iterator[tuple[str, str, list[str]]]:
 def times(draws: int) -> Iterator[tuple[str, str, list[str]]]:
     """Yields the same for env steps to a threshold, which are lognormal with the median 1."""
     for name, solved_share, earliest in (
-        ("1 of 10 never", 0.9, 1.0),
-        ("4 of 10 never", 0.6, 1.0),
-        ("2 of 10 never, trained for unlike times", 0.8, 0.5),
+        ("1 of 10 unsolved", 0.9, 1.0),
+        ("4 of 10 unsolved", 0.6, 1.0),
+        ("2 of 10 unsolved, different budgets", 0.8, 0.5),
     ):
         last = float(stats.lognorm(1).ppf(solved_share))
         until = earliest * last

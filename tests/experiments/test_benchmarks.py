@@ -50,7 +50,7 @@ def test_c_mujoco_stands_beside_its_own_precision_of_the_same_call():
     cells = [cell.strip() for cell in line.split("|")[1:-1]]
     assert cells == ["Hopper-v5", "512 x 20", "2.00e6", "4.00e5", "1.00e5", "4.0", "20", ""]
     sentence = " ".join(tables.words(raw).splitlines())
-    assert "4.0 (Hopper) to 4.0 (Hopper) times the speed of C MuJoCo in equal precision" in sentence
+    assert "4.0 (Hopper) to 4.0 (Hopper) times as fast as C MuJoCo in float64" in sentence
 
 
 def test_peers_say_their_precision_and_settings():

@@ -112,11 +112,11 @@ def readme(raw: Raw) -> str:
     """The line of README.md."""
     on_gpu, warp = (best(raw.gpu, FEW[2], engine) for engine in ("native", "MuJoCo Warp"))
     on_cpu, equal = (best(raw.cpu, FEW[2], "native", x) for x in ("float32", "float64"))
-    c_mujoco = best(raw.cpu, FEW[2], "C MuJoCo")
+    other = best(raw.cpu, FEW[2], "C MuJoCo")
     return textwrap.fill(
-        f"HalfCheetah plays {rate(on_gpu)} env steps per second on one H100, {ratio(on_gpu, warp)}"
-        f" times as many as in MuJoCo Warp. On two CPU cores it plays {rate(on_cpu)}, "
-        f"{ratio(on_cpu, c_mujoco)} times C MuJoCo's ({ratio(equal, c_mujoco)} in float64).",
+        f"On one H100, HalfCheetah runs {rate(on_gpu)} env steps per second, {ratio(on_gpu, warp)} "
+        f"times as many as in MuJoCo Warp. On two CPU cores, it runs {rate(on_cpu)}, "
+        f"{ratio(on_cpu, other)} times as many as in C MuJoCo ({ratio(equal, other)} in float64).",
         110,
     )
 
@@ -132,9 +132,9 @@ def words(raw: Raw) -> str:
         single.append((task, cpu, c_mujoco))
         equal.append((task, double, c_mujoco))
     return textwrap.fill(
-        f"On two cores `native` plays the first six tasks at {span('the speed of C MuJoCo', equal)}"
-        f" in equal precision. In float32, used for training, it is {span('its speed', single)}."
-        f" On the GPU it is {span('the speed of MuJoCo Warp', warp)}.",
+        f"On two cores, `native` plays the first six tasks {span('as fast as C MuJoCo', equal)} in"
+        f" float64, and {span('as fast', single)} in float32, which training uses. On the GPU, it"
+        f" is {span('as fast as MuJoCo Warp', warp)}.",
         110,
     )
 
