@@ -3,7 +3,6 @@
 import functools
 import os
 import sys
-import threading
 from pathlib import Path
 
 from mjx_reinforce.engine.play.objects import distrust, make_folder
@@ -44,8 +43,6 @@ def configure_jax() -> None:
             f"JAX cannot compute here: JAX_PLATFORMS is {settings['jax_platforms']!r}, for which "
             "no plugin is installed; install JAX for it (pip install 'jax[cuda12]'), or unset it"
         ) from error
-    # A GPU's first program takes two seconds to start, while Python imports what else is needed.
-    threading.Thread(target=jax.numpy.zeros, args=((),)).start()
 
 
 def _choose_cache() -> None:

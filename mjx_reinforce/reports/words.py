@@ -149,11 +149,11 @@ def _few(findings: Findings) -> Iterator[str]:
     best, second = (each.scores for each in findings.results[:2])
     counts = [count for count in _COUNTS if 10 * count <= min(len(best), len(second))]
     if counts and best.mean() != second.mean():
-        wrong = [f"{n} seeds {percent(wrong_winner(best, second, n))} of the time" for n in counts]
+        wrong = [f"{percent(wrong_winner(best, second, n))} of the time with {n}" for n in counts]
         needed = seeds_needed(best, second)
         found = f"{needed:,} seeds of each would" if needed else "10,000 seeds of each would not"
         yield (
-            f"Few seeds would have named the wrong winner: {', '.join(wrong)}. {found} find the "
+            f"With few seeds, the wrong one would have won: {', '.join(wrong)}. {found} find the "
             "difference four times out of five."
         )
 

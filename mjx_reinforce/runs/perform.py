@@ -93,22 +93,23 @@ def own_directory(directory: Path, interrupt: Interrupt, *, resumed: bool) -> It
         process's.
     """
     made: list[Path] = []
-    try:
-        made = [folder for folder in (directory, *directory.parents) if not folder.exists()]
-        if not resumed:
-            _make(directory)
-        _try_to_write(directory)
-    except OSError as error:
-        remove_empty(made)
-        remedy = "make room there" + ("" if resumed else ", or choose another --output")
-        raise ValueError(
-            f"cannot write to the run directory {directory} ({error.strerror}); {remedy}"
-        ) from error
-    with locked(directory):  # a folder in which another trains stays
-        interrupt.on_exit(lambda: remove_empty(made))
+    with contextlib.ExitStack() as held:
         try:
+            made = [folder for folder in (directory, *directory.parents) if not folder.exists()]
+            if not resumed:
+                _make(directory)
+            _try_to_write(directory)
+            held.enter_context(locked(directory))  # a folder in which another trains stays
             if not resumed:
                 _check_unbegun(directory)  # not before: another may have been quicker
+        except OSError as error:
+            remove_empty(made)
+            remedy = "make room there" + ("" if resumed else ", or choose another --output")
+            raise ValueError(
+                f"cannot write to the run directory {directory} ({error.strerror}); {remedy}"
+            ) from error
+        interrupt.on_exit(lambda: remove_empty(made))
+        try:
             yield
         finally:
             remove_empty(made)

@@ -113,8 +113,8 @@ def run(
       config: the settings, such as ``mjx_reinforce.of_task("Hopper-v5")``; others by
         ``dataclasses.replace``.
       output: the directory of the run's files. None, with ``config.output`` None too, writes none.
-      observers: functions that are called with each evaluation. One that returns a true value
-        ends the run after the current block of updates.
+      observers: functions that are called with each evaluation, first with that of the untrained
+        policies. One that returns a true value ends the run after the current block of updates.
       quiet: show no progress.
 
     Returns:

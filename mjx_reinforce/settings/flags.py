@@ -55,7 +55,7 @@ def read_command_line(
     Raises:
       ValueError: a word or a value is empty, which would be read as the current folder.
     """
-    if any(not word or re.fullmatch("--.*=", word) for word in arguments):
+    if any(not word or re.fullmatch("--[^=]+=", word) for word in arguments):
         raise ValueError("a value on the command line is empty; is a variable of the shell unset?")
     _give_help(form)
     options: dict[str, Any] = {"registry": _READERS, "config": (tyro.conf.OmitArgPrefixes,)}

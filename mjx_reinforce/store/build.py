@@ -145,7 +145,6 @@ def _build_estimator(config: Config, horizon: int) -> Estimator:
 
 
 def _build_value_baseline(config: Config, horizon: int) -> Estimator:
-
     return value_baseline(
         config.discount,
         horizon=horizon,
@@ -157,7 +156,6 @@ def _build_value_baseline(config: Config, horizon: int) -> Estimator:
 
 
 def _build_optimizer(config: Config) -> optax.GradientTransformation:
-
     rate = config.learning_rate
     final = rate / 10 if config.final_learning_rate is None else config.final_learning_rate
     optimizer = make_optimizer(
