@@ -178,7 +178,7 @@ def caveats(findings: Findings) -> Iterator[str]:
         yield f'The sources were made with different {name}: see "Where this comes from".'
     if min(sizes) < _FEW_SEEDS:
         yield (
-            f"{counted(min(sizes), 'seed')} per configuration: with fewer than {_FEW_SEEDS}, "
+            f"A configuration has {counted(min(sizes), 'seed')}: with fewer than {_FEW_SEEDS}, "
             "intervals hold the truth less than 95% of the time. Below six, there are none."
         )
     if failed := sum(int(np.sum(~np.isfinite(each.final))) for each in results):

@@ -210,8 +210,7 @@ def _call(
 def _sized(kernel: ptx.Kernel, items: int) -> tuple[ptx.Kernel, tuple[int, int]]:
     """Returns the kernel, and how many blocks of how many threads, that play so many items."""
     if kernel.lanes > 1:
-        processors = jax.devices()[0].core_count
-        kernel = team.for_items(kernel, items, processors, compute_capability())
+        kernel = team.for_items(kernel, items, jax.devices()[0].core_count, compute_capability())
     return kernel, _grid(items * kernel.lanes, kernel.threads, kernel.blocks)
 
 

@@ -46,13 +46,20 @@ def solve_touching(solver: Solver, model: mjx.Model, data: mjx.Data) -> Solution
     """
     contact = jax_fields(data).contact
     kinds = [k for dim in (1, 3, 4, 6) if (k := np.flatnonzero(contact.dim == dim)).size]
-    # Contacts of a kind. More room costs time in every solve. Of the states that random and trained
-    # policies led to, more than 99.9% had room (700 to 24,000 states a task).
-    room, rows = math.ceil(0.4 * model.nv), jax_fields(data).efc_D.size
+    room, rows = _room(model), jax_fields(data).efc_D.size
     saved = sum(_rows_of_one(contact, kind) * max(0, kind.size - room) for kind in kinds)
     if 2 * saved < rows or not is_written_out():
         return solver(model, data)
     return _with_few(solver, model, data, kinds, room)
+
+
+def _room(model: mjx.Model) -> int:
+    """Returns for how many contacts of each kind there is room.
+
+    More room costs time in every solve. Of the states that random and trained policies led to, more
+    than 99.9% had room (700 to 24,000 states a task).
+    """
+    return math.ceil(0.4 * model.nv)
 
 
 def _with_few(
