@@ -134,7 +134,7 @@ def words(raw: Raw) -> str:
     return textwrap.fill(
         f"On two cores, `native` plays the first six tasks {span('as fast as C MuJoCo', equal)} in"
         f" float64, and {span('as fast', single)} in float32, which training uses. On the GPU, it"
-        f" is {span('as fast as MuJoCo Warp', warp)}.",
+        f" plays them {span('as fast as MuJoCo Warp', warp)}.",
         110,
     )
 
