@@ -161,7 +161,9 @@ class RunFiles(Files[Driver]):
             reached = None if found is None else driver.updates()
             again = "" if reached else ": there is no checkpoint yet, so it begins again"
             self._say(f"going on after {reached or 0} updates{again}")
-        self._sinks = open_sinks(driver.config, self._directory, reached)
+        # The evaluation of the present policies is made again, unless the record has it.
+        kept = reached if reached is None or driver.record.is_evaluated() else reached - 1
+        self._sinks = open_sinks(driver.config, self._directory, kept)
 
     def _write_first(self, config: Config) -> None:
         """Writes config.json, and a metrics.csv that has no rows yet."""

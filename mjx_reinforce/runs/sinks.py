@@ -73,8 +73,8 @@ class TensorBoard:
 
         Args:
           directory: of the run.
-          updates: after how many a resumed run goes on: TensorBoard drops what older files have
-            of later ones. None drops everything.
+          updates: of the last evaluation that a resumed run keeps: TensorBoard drops what older
+            files have of later ones. None drops everything.
         """
         folder = directory / "tensorboard"
         folder.mkdir(exist_ok=True)
@@ -170,7 +170,7 @@ def open_sinks(config: Config, directory: Path, updates: int | None) -> list[Sin
     Args:
       config: the settings.
       directory: of the run; its metrics.csv has the rows from before.
-      updates: after how many a resumed run goes on; None at the first evaluation.
+      updates: of the last evaluation that a resumed run keeps; None at the first evaluation.
 
     Raises:
       OSError: one of them cannot be written.

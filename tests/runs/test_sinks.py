@@ -2,6 +2,7 @@
 
 import csv
 import errno
+import shutil
 import struct
 import sys
 from types import SimpleNamespace
@@ -11,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import mjx_reinforce as mr
 from mjx_reinforce import train as train_module
 from mjx_reinforce.runs import sinks
 from mjx_reinforce.runs.saving import RunFiles
@@ -152,21 +154,6 @@ def test_tensorboard_has_the_numbers(directory):
         np.testing.assert_allclose(shown[5][name], value, rtol=1e-6, err_msg=name)
 
 
-def test_tensorboard_of_a_resumed_run_shows_no_step_twice(directory):
-    """It was killed after 10 updates and went on from 5, then of 3 seeds."""
-    config = Config(log=("tensorboard",))
-    [killed] = sinks.open_sinks(config, directory, None)
-    for update in (0, 5, 10):
-        killed.write(evaluation(update))
-    [resumed] = sinks.open_sinks(config, directory, 5)
-    resumed.write(evaluation(10, num_seeds=3))
-    resumed.write(evaluation(15, num_seeds=3))
-    shown = events_of(directory / "tensorboard")
-    assert list(shown) == [0, 5, 10, 15]
-    assert "eval_return/seed_15" in shown[5]
-    assert "eval_return/seed_15" not in shown[10]
-
-
 def test_a_run_that_starts_again_drops_everything(directory):
     for _ in range(2):
         [charted] = sinks.open_sinks(Config(log=("tensorboard",)), directory, None)
@@ -247,15 +234,21 @@ def test_a_missing_package_is_named_before_anything_starts(tmp_path, monkeypatch
 
 @pytest.mark.slow
 def test_a_run_with_a_sink_and_its_resumption(run, tmp_path):
-    size = ["--num-seeds", "2", "--eval-episodes", "2", "--hidden-sizes", "4"]
-    size += ["--env", "Survive-v0", "--env-steps", "None", "--num-episodes", "4"]
-    sinks = ["--log", "tensorboard", "--output", "out"]
-    assert run(*size, "--max-updates", "8", *sinks) == 0
-    assert run("--resume", "out", "--max-updates", "15") == 0
-    out = tmp_path / "out"
-    table = as_csv(out / "metrics.csv")
-    shown = events_of(out / "tensorboard")
-    assert list(shown) == sorted({int(row["update"]) for row in table})
-    last = [row for row in table if row["update"] == 15]
-    for name in ("eval_return", "kl", "policy_std", "gradient_snr", "explained_variance"):
-        assert shown[15][f"{name}/seed_1"] == pytest.approx(last[1][name], rel=1e-6)
+    """It goes on from what a kill leaves after an evaluation that no checkpoint has, then again."""
+    size = {"num_seeds": 2, "eval_episodes": 2, "hidden_sizes": (4,), "num_episodes": 4}
+    often = {"eval_every": 1, "checkpoint_every": 1, "log": ("tensorboard",)}
+    config = Config(env="CartPole-v1", env_steps=None, max_updates=6, **size, **often)
+    left = tmp_path / "left"
+
+    def kill(evaluation):
+        if evaluation.updates[0] == 3:
+            shutil.copytree(tmp_path / "out", left)
+
+    mr.run(config, output=tmp_path / "out", observers=[kill], quiet=True)
+    for updates in ("5", "8"):
+        assert run("--resume", "left", "--max-updates", updates) == 0
+    table, shown = as_csv(left / "metrics.csv"), events_of(left / "tensorboard")
+    assert list(shown) == sorted({int(row["update"]) for row in table}) == list(range(9))
+    last = [row for row in table if row["update"] == 8]
+    for name in ("eval_return", "kl", "gradient_snr", "explained_variance"):
+        assert shown[8][f"{name}/seed_1"] == pytest.approx(last[1][name], rel=1e-6)

@@ -220,6 +220,5 @@ def _grid(items: int, most: int, blocks: int) -> tuple[int, int]:
     They are spread over all multiprocessors, each of which has so many blocks at most.
     """
     processors = jax.devices()[0].core_count
-    warps = -(-items // (_WARP * processors))
-    threads = min(_WARP * warps, most)
+    threads = min(_WARP * -(-items // (_WARP * processors)), most)
     return min(-(-items // threads), blocks * processors), threads
