@@ -250,9 +250,9 @@ class Player(NamedTuple):
     Examples:
       >>> import numpy as np
       >>> import mjx_reinforce as mr
-      >>> player = mr.load("HalfCheetah-v5")  # it comes with the package
-      >>> player.env, player.act(np.zeros(17)).shape, player.act(np.zeros((5, 17))).shape
-      ('HalfCheetah-v5', (6,), (5, 6))
+      >>> player = mr.load("CartPole-v1")  # it comes with the package
+      >>> player.act(np.array([0.0, 0.0, 0.1, 0.0]))  # the pole leans to the right
+      1
     """
 
     env: str

@@ -154,7 +154,7 @@ _NEEDED = {"tensorboard": "tensorboardX", "wandb": "wandb"}
 
 def _check_installed(log: str) -> None:
     """Raises ValueError if a log's package is missing; imports nothing."""
-    package = _NEEDED.get(log, "json")  # which is always there
+    package = _NEEDED[log]
     spec = importlib.util.find_spec(package)
     # A folder of that name, such as W&B leaves, is found too, but has no origin.
     if spec is None or spec.origin is None:
