@@ -121,8 +121,8 @@ print(f"mean return of the last update: {returns[-1]:.0f}")
 # %% [markdown]
 # ## The same in the library
 #
-# The library's defaults differ from our program: it also scales the observations, divides the weights by their standard
-# deviation, limits the norm of the gradient, and has two layers of 32 units.
+# The library's defaults differ from our program: it also scales the observations, divides the weights by their root
+# mean square, limits the norm of the gradient, and has two layers of 32 units.
 
 # %%
 learner = mr.reinforce(env, num_episodes=EPISODES, horizon=HORIZON)

@@ -1,6 +1,6 @@
 """Shares of a run as Ray tasks, one for each GPU of a cluster, and one report of all seeds.
 
-``pip install "mjx-reinforce[ray]"``, then ``python experiments/examples/on_ray.py DIR --num-seeds
+``pip install -e ".[ray]"``, then ``python experiments/examples/on_ray.py DIR --num-seeds
 1024 --share 128 --gpus 1 --env Hopper-v5``; other flags are those of ``python -m
 mjx_reinforce.train``. All machines must see DIR. A share that was interrupted goes on: start the
 same command again.

@@ -170,7 +170,7 @@ class EstimatorSettings:
     discount: float = _for_gradients(0.99, Range.SHARE, Mark.TRACED)
     """Discount of rewards, in [0, 1]."""
     standardize_floor: float | None = _for_reinforce(10.0, Range.NOT_NEGATIVE, Mark.TRACED)
-    """The weights are divided by their standard deviation plus this number, in units of return.
+    """The weights are divided by their root mean square plus this number, in units of return.
     None: they are not divided."""
     value_learning_rate: float = _for_gradients(
         3e-3, Range.POSITIVE, Reader.VALUE_BASELINE, Mark.TRACED

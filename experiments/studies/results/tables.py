@@ -12,7 +12,7 @@ from experiments.kit.markdown import fixed, percent, table
 from experiments.studies.results import kept
 from experiments.studies.results.kept import POLICIES, Columns, Group, Result
 from experiments.studies.results.tasks import PUBLISHED_SEEDS
-from mjx_reinforce.statistics import Estimate, estimate_mean, finite_or_nan, iqm, iqm_interval
+from mjx_reinforce.statistics import Estimate, estimate_mean, finite_or_nan
 
 #: Env steps within which the pendulum should be solved.
 WITHIN = (50_000, 100_000)
@@ -45,29 +45,10 @@ def published_interval(mean: float, deviation: float) -> Estimate:
     return Estimate(mean, mean - half, mean + half)
 
 
-def verdict(ours: Estimate, published: tuple[float, float] | None) -> str:
-    """Returns where our mean is: "above", "below" or "not apart" from a published one.
-
-    Args:
-      ours: with its interval; NaN where a seed failed.
-      published: mean and standard deviation over seeds; None where there is none.
-    """
-    if published is None:
-        return "none published"
-    theirs = published_interval(*published)
-    if not math.isfinite(ours.value):
-        return "none: a seed failed"
-    if not (math.isfinite(ours.low) and math.isfinite(ours.high)):
-        return "not apart" if ours.value == theirs.value else "no interval"
-    if ours.low > theirs.high:
-        return "above"
-    return "below" if ours.high < theirs.low else "not apart"
-
-
 def of_tasks(results: Sequence[Result]) -> str:
     """Returns the table of all tasks by env steps."""
-    header = ["task", "seeds", "env steps per seed", "IQM (95%)", "mean (95%)", "worst seed"]
-    header += ["solved at the end (threshold)", "published (95%)", "our mean is"]
+    header = ["task", "seeds", "env steps per seed", "mean (95%)", "worst seed"]
+    header += ["solved at the end (threshold)", "published (95%)"]
     return table([*header, "training, compiling", "machine"], map(_result_row, results))
 
 
@@ -77,19 +58,16 @@ def _result_row(result: Result) -> list[str]:
     solved = "no threshold"
     if threshold is not None:
         solved = f"{int(np.sum(tested >= threshold)):,} of {len(tested):,} ({threshold:,g})"
-    machine = f"{facts['num_devices']} {facts['device']}"
     return [
         result.task.name,
         f"{len(tested):,}",
         f"{facts['settings']['env_steps']:,}",
-        estimate(Estimate(iqm(tested), *iqm_interval(tested))),
         estimate(estimate_mean(tested)),
         "failed" if np.isnan(tested).any() else number(tested.min()),
         solved,
         "none" if published is None else estimate(published_interval(*published)),
-        verdict(estimate_mean(tested), published),
         f"{seconds(facts['run_seconds'])}, {seconds(facts['compile_seconds'])}",
-        f"{facts['cpu_count']} CPU cores" if facts["device"] == "cpu" else machine,
+        f"{facts['cpu_count']} cores" if facts["device"] == "cpu" else _short(facts["device"]),
     ]
 
 
@@ -121,13 +99,13 @@ def gpu(groups: Sequence[Group], docs: Path) -> str:
     rows = [
         [
             group.task,
-            group.device.removeprefix("NVIDIA ").split()[0],
+            _short(group.device),
             str(len(group.final)),
             f"{number(group.minute.mean())}, {number(group.minute.min())}",
             estimate(estimate_mean(group.final)),
             *map(number, (group.final.min(), group.final.max())),
             seconds(group.seconds) + _stopped(group),
-            f"{group.env_steps:.2g}".replace("e+0", "e").replace("e+", "e"),
+            _steps_of(group.env_steps),
             *(_published(docs, group.task, algorithm) for algorithm in ("PPO", "SAC")),
         ]
         for group in groups
@@ -138,11 +116,21 @@ def gpu(groups: Sequence[Group], docs: Path) -> str:
     return table([*header, "SAC, published"], rows)
 
 
+def _steps_of(env_steps: float) -> str:
+    """Returns a number of env steps in two digits."""
+    return f"{env_steps:.2g}".replace("e+0", "e").replace("e+", "e")
+
+
+def _short(device: str) -> str:
+    """Returns the name of a GPU in a word."""
+    return device.removeprefix("NVIDIA ").split()[0]
+
+
 def _published(docs: Path, task: str, algorithm: str) -> str:
     figure = kept.published(docs / "published.csv", task, algorithm)
     if figure is None:
         return "none"
-    return f"{number(figure.mean)} ({figure.source}, {figure.env_steps / 1e6:.2g} million)"
+    return f"{number(figure.mean)} ({_steps_of(figure.env_steps)})"
 
 
 def cpu(groups: Sequence[Group], docs: Path) -> str:
@@ -151,7 +139,7 @@ def cpu(groups: Sequence[Group], docs: Path) -> str:
     rows = [
         [
             group.task,
-            group.device,
+            group.device.partition(",")[0],
             str(len(group.final)),
             _spread(group.minute),
             f"{_spread(group.final)} after {seconds(group.seconds)}{_stopped(group)}",
@@ -204,7 +192,9 @@ def play(played: Mapping[str, Columns], docs: Path) -> str:
             film = Path("films", f"{task}-{policy}.gif")
             shown = f"[video]({film.as_posix()})" if (docs / film).exists() else ""
             label = f"{policy} ({columns['seed'][mine][0]})"
-            rows.append([task, label, *map(estimate, found), shown])
+            *means, difference = found
+            means = [number(x.value) for x in means]
+            rows.append([task, label, *means, estimate(difference), shown])
     header = ["task", "policy (seed)", "here", "Gymnasium", "Gymnasium less here", "video"]
     return table(header, rows)
 
