@@ -14,7 +14,6 @@ from mjx_reinforce.learning.estimators import (
     discount_weights,
     leave_one_out,
     reward_to_go,
-    shift_rewards,
     standardize,
     total_return,
 )
@@ -118,7 +117,6 @@ __all__ = [
     "rollout",
     "run",
     "save_policy",
-    "shift_rewards",
     "standardize",
     "sweep",
     "tanh_normal",

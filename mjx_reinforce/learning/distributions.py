@@ -44,8 +44,6 @@ class Distribution(NamedTuple):
       std: (outputs [..., K]) -> [..., A] the standard deviation in the action's unit, before what
         the family does to keep actions in their range; None where there is none
       kl: (outputs, other outputs) -> [...] the divergence KL(first || second) in nats, if known
-      fisher: (constants [K - num_outputs]) -> [K] the diagonal of the Fisher matrix in ``outputs``,
-        of a family in which it is diagonal and depends on these alone; else None
 
     Examples:
       >>> import jax, jax.numpy as jnp
@@ -65,7 +63,6 @@ class Distribution(NamedTuple):
     entropy: Callable[[jax.Array], jax.Array]
     std: Callable[[jax.Array], jax.Array] | None = None
     kl: Callable[[jax.Array, jax.Array], jax.Array] | None = None
-    fisher: Callable[[jax.Array], jax.Array] | None = None
 
     def __repr__(self) -> str:
         return f"Distribution({self.num_outputs} outputs, {len(self.constants)} constants)"
@@ -115,16 +112,13 @@ def normal(
     def kl(outputs, others):
         return jnp.sum(normal_kl(*layout.split(outputs), *layout.split(others)), axis=-1)
 
-    def fisher(constants):
-        return jnp.concatenate([(layout.half * jnp.exp(-constants)) ** 2, 2.0 + 0.0 * constants])
-
     family = layout.family(
         sample=lambda noise, mean, std: mean + std * noise,
         mode=lambda mean: mean,
         log_density=normal_log_density,
         entropy=lambda mean, std: normal_entropy(std),
     )
-    return family._replace(kl=kl, fisher=fisher if std == "parameter" else None)
+    return family._replace(kl=kl)
 
 
 def normal_softplus(

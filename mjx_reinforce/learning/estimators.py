@@ -17,7 +17,6 @@ An episode in which the simulation left the finite numbers counts as the worst o
 each step its G[t] is the least of theirs (``replace_broken``).
 """
 
-import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -190,39 +189,6 @@ def discount_weights(estimator: Estimator, discount: float | jax.Array = 0.99) -
         weight, state, metrics = estimator.update(state, trajectory)
         powers = discount ** jnp.arange(weight.shape[0], dtype=weight.dtype)
         return weight * powers[:, None], state, metrics
-
-    return estimator._replace(update=update)
-
-
-def shift_rewards(estimator: Estimator, shift: float | jax.Array) -> Estimator:
-    """Gives an estimator the rewards less ``shift``, which is what the policy then learns from.
-
-    Where an episode can end early, that is another objective: a bonus for every step survived is
-    worth that much less (Mania et al. 2018, arXiv:1803.07055, subtract the survival
-    bonus of MuJoCo's walkers, whose policies would else learn to stand still). Where all episodes
-    are of one length, the gradient is the same up to its noise. Returns that are reported stay
-    those of the task.
-
-    Args:
-      estimator: whose rewards are shifted.
-      shift: subtracted from the reward of every step, in its unit; it may be negative.
-
-    Raises:
-      ValueError: what is given is no estimator, or the shift is no finite number.
-
-    Examples:
-      >>> import mjx_reinforce as mr
-      >>> mr.shift_rewards(mr.reward_to_go(1.0), 1.0)
-      Estimator(of 1 episodes or more)
-    """
-    check_kind("estimator", estimator, Estimator, "mjx_reinforce.reward_to_go(0.99)")
-    number = known_number(shift)
-    if not (number is None or math.isfinite(number)):
-        raise ValueError(f"the shift of the rewards must be a finite number, got {shift!r}")
-
-    def update(state, trajectory):
-        reward = jnp.where(trajectory.mask, trajectory.reward - shift, 0.0)
-        return estimator.update(state, dataclasses.replace(trajectory, reward=reward))
 
     return estimator._replace(update=update)
 

@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 
 from mjx_reinforce.engine.checks import check_count, check_kind, check_number
 from mjx_reinforce.learning.policy import Policy
-from mjx_reinforce.learning.updates import Problem, Update, accumulate, draw_steps, whole_rollout
+from mjx_reinforce.learning.updates import Problem, Update, draw_steps, whole_rollout
 
 #: Conjugate gradients know F from so many of the visited steps at most.
 MAX_FISHER_STEPS = 4096
@@ -45,11 +45,9 @@ def natural_gradient(
     the place of a gradient: ``optax.sgd(1.0)`` makes the step as it is, and a schedule shortens it.
     ``reinforce(max_kl=...)`` shortens a step for which the model was too good.
 
-    Where a linear policy has a distribution whose Fisher matrix depends on constants alone
-    (``normal``), F is exact, a matrix (O + 1) x (O + 1) for each entry of the action, which is
-    factored. Else conjugate gradients solve for x, with products of F and a vector that are two
-    passes through the network (Schulman et al. 2015, appendix C), over all visited steps or
-    ``MAX_FISHER_STEPS`` that are drawn.
+    Conjugate gradients solve for x, with products of F and a vector that are two passes through the
+    network (Schulman et al. 2015, appendix C), over all visited steps or ``MAX_FISHER_STEPS`` that
+    are drawn.
 
     The metrics are those of ``full_batch``; ``gradient_norm`` and ``gradient_snr`` are of g.
 
@@ -87,10 +85,7 @@ def natural_gradient(
             "the natural gradient needs a distribution whose KL divergence is known: choose "
             "normal, normal-softplus, normal-sigmoid or categorical, or another update"
         )
-    if policy.distribution.fisher is not None and _is_linear(policy):
-        solve = _exact(policy, damping)
-    else:
-        solve = _by_conjugate_gradients(policy, damping, iterations)
+    solve = _by_conjugate_gradients(policy, damping, iterations)
 
     def turn(problem, key, params, gradient):
         flat, unravel = ravel_pytree(gradient)
@@ -104,47 +99,10 @@ def natural_gradient(
     return whole_rollout(turn)
 
 
-def _is_linear(policy: Policy) -> bool:
-    """Returns whether these are the parameters of an ``mlp_policy`` without hidden layers."""
-    params = jax.eval_shape(policy.init, jax.random.key(0))
-    layer = {"params": {"Dense_0": {"bias": 0, "kernel": 0}}}
-    like = {"network": layer, "constants": 0}
-    return jax.tree.structure(params) == jax.tree.structure(like)
-
-
-def _exact(policy: Policy, damping: float | jax.Array) -> LinearSolver:
-    """Factors F: kron(E[o o^T], D) of the weights with D diagonal, and a diagonal of constants."""
-
-    def solve(problem, key, params, gradient):
-        del key
-
-        def products(chunk):
-            observation, mask = chunk
-            seen = jnp.concatenate([observation, jnp.ones((*mask.shape, 1))], axis=-1)
-            seen = jnp.where(mask[..., None], seen, 0.0)
-            return jnp.einsum("tni,tnj->ij", seen, seen, precision="highest")
-
-        observation, *_, mask = problem.samples
-        second = accumulate(products, (observation, mask)) / jnp.maximum(jnp.sum(mask), 1)
-        fisher = policy.distribution.fisher(params["constants"])  # type: ignore[misc]
-        means, constants = jnp.split(fisher, [policy.distribution.num_outputs])
-        matrices = means[:, None, None] * second + damping * jnp.eye(len(second))
-        layer = gradient["network"]["params"]["Dense_0"]
-        right = jnp.concatenate([layer["kernel"], layer["bias"][None]]).T[..., None]
-        factors = jnp.linalg.cholesky(matrices)
-        weights = jax.scipy.linalg.cho_solve((factors, True), right)[..., 0].T
-        return {
-            "network": {"params": {"Dense_0": {"kernel": weights[:-1], "bias": weights[-1]}}},
-            "constants": gradient["constants"] / (constants + damping),
-        }
-
-    return solve
-
-
 def _by_conjugate_gradients(
     policy: Policy, damping: float | jax.Array, iterations: int
 ) -> LinearSolver:
-    """Solves with products of F alone."""
+    """Returns what solves with products of F alone."""
 
     def solve(problem, key, params, gradient):
         observation, *_, mask = problem.samples

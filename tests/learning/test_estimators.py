@@ -208,21 +208,7 @@ def test_standardize_by_default_does_not_centre_and_adds_almost_nothing():
     np.testing.assert_allclose(got, expected, rtol=1e-5)
 
 
-def shift(estimator):
-    return est.shift_rewards(estimator, 0.5)
-
-
-def test_a_shift_is_taken_off_the_reward_of_every_step_and_of_no_other():
-    trajectory = make_trajectory()
-    shifted = trajectory.replace(reward=jnp.where(trajectory.mask, trajectory.reward - 0.5, 0.0))
-    for make in (est.reward_to_go, est.leave_one_out, value_baseline):
-        assert_equal(update(shift(make(0.9)), trajectory), update(make(0.9), shifted))
-    raw, got = (weights(e(est.reward_to_go(1.0)), trajectory) for e in (lambda e: e, shift))
-    left = np.where(MASK, LENGTHS - np.arange(4)[:, None], 0)
-    np.testing.assert_allclose(got, raw - 0.5 * left, rtol=1e-6)
-
-
-@pytest.mark.parametrize("wrap", [est.standardize, est.discount_weights, shift])
+@pytest.mark.parametrize("wrap", [est.standardize, est.discount_weights])
 def test_wrapping_keeps_what_an_estimator_requires_learns_and_measures(wrap):
     inner = value_baseline(0.9)
     assert wrap(est.leave_one_out()).min_episodes == 2
@@ -230,16 +216,15 @@ def test_wrapping_keeps_what_an_estimator_requires_learns_and_measures(wrap):
     _, wrapped_critic, wrapped_metrics = update(wrap(inner), make_trajectory())
     assert jax.tree.structure(critic) == jax.tree.structure(wrapped_critic)
     assert metrics.keys() <= wrapped_metrics.keys()
-    if wrap is not shift:  # which changes what is learned
-        assert_equal(critic, wrapped_critic)
-        assert_equal(metrics, {name: wrapped_metrics[name] for name in metrics})
+    assert_equal(critic, wrapped_critic)
+    assert_equal(metrics, {name: wrapped_metrics[name] for name in metrics})
 
 
 @pytest.mark.parametrize(
     ("name", "wrap"),
     [
         *((name, lambda e: e) for name in sorted(MAKERS)),
-        *(("value-baseline", wrap) for wrap in (est.standardize, est.discount_weights, shift)),
+        *(("value-baseline", wrap) for wrap in (est.standardize, est.discount_weights)),
     ],
 )
 def test_nothing_after_the_end_has_any_effect_on_the_weights(name, wrap):
@@ -350,9 +335,7 @@ def test_nonsense_is_refused():
             value_baseline(**{name: 0})  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="num_fits must be at least 1, got 0"):
         full_batch_value_baseline(num_fits=0)
-    with pytest.raises(ValueError, match="must be a finite number, got nan"):
-        est.shift_rewards(est.reward_to_go(), float("nan"))
     with pytest.raises(ValueError, match="estimator"):
-        est.shift_rewards(est.reward_to_go, 1.0)  # type: ignore[arg-type]
+        est.standardize(est.reward_to_go)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="at least 2 episodes"):
         reinforce(Chain(), policy=tabular_policy(), estimator=est.leave_one_out(), num_episodes=1)

@@ -167,11 +167,6 @@ CASES = {
     "value": (lambda d: fitted(value_baseline(d, batch_size=8, **CRITIC)), of_all_steps, 1),
     "full-batch": (lambda d: fitted(full_batch_value_baseline(d, **CRITIC)), of_all_steps, 1),
     "discount^t": (lambda d: est.discount_weights(est.leave_one_out(d), d), of_the_start, 2),
-    "shifted": (
-        lambda d: est.shift_rewards(est.leave_one_out(d), 0.5),
-        lambda limit, discount: of_all_steps(limit, discount, REWARD - 0.5),
-        2,
-    ),
     "mean log-prob": (variants.mean_log_prob, of_mean_to_go, 1),
     "normalized": (variants.normalized_returns, of_weights(normalized), 1),
     "standardized": (

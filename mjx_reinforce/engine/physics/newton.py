@@ -6,9 +6,10 @@ The acceleration a minimizes (MuJoCo's documentation, "Computation", "Constraint
 
 with the unconstrained acceleration a_s, the inertia matrix M and, of the constraint rows, the
 Jacobian J, reference r and constraint mass D (``efc_J``, ``efc_aref``, ``efc_D``); rows of equality
-constraints count on both sides of zero. The cost is convex, and quadratic for a given set of active
-rows, so that Newton's method, with an exact line search, ends after finitely many steps: when a
-full step leaves the set as it is, that step led to the minimum.
+constraints count on both sides of zero. So do those of friction loss, whose force is at most the
+loss: a row that would need more *slides*, and its cost is linear. The cost is convex, and quadratic
+for a given set of active and sliding rows, so that Newton's method, with an exact line search, ends
+after finitely many steps: when a full step leaves the set as it is, that step led to the minimum.
 
 MJX's own solver does the same steps, but its line search evaluates three points in each of
 ``ls_iterations`` (50) rounds, which ``jax.vmap`` carries out for every episode until the slowest is
@@ -34,6 +35,8 @@ from mjx_reinforce.engine.physics.inertia import solve
 from mjx_reinforce.engine.physics.mjx_internals import jax_fields
 from mjx_reinforce.engine.scalar import skippable
 
+#: An interval is narrow if its lower end is at least this share of its upper end.
+_NARROW = 0.999
 # mjMINVAL: what C takes for zero.
 _MIN_TRACE = 1e-15
 
@@ -44,21 +47,41 @@ class Rows(NamedTuple):
     jacobian: J
     reference: [rows] r
     constraint_mass: [rows] D
-    equality: [rows] whether a row is active on both sides
+    both_sides: [rows] whether a row is active on both sides
+    loss: [rows of equality and friction loss, which come first] the most that each pushes, inf for
+      equality; None if no row has friction loss
     """
 
     jacobian: Any
     reference: jax.Array
     constraint_mass: jax.Array
-    equality: jax.Array
+    both_sides: jax.Array
+    loss: jax.Array | None = None
 
     def active(self, residual: jax.Array) -> jax.Array:
-        """Returns which rows push at residuals [rows]; a NaN pushes, so that it is not lost."""
-        return self.equality | ~(residual >= 0)
+        """Returns which rows push as springs at residuals [rows]; a NaN does, not to be lost."""
+        pushes = self.both_sides | ~(residual >= 0)
+        return pushes if self.loss is None else pushes & (self.sliding(residual) == 0)
 
     def force(self, residual: jax.Array) -> jax.Array:
         """Returns the rows' forces, [rows]."""
-        return jnp.where(self.active(residual), -self.constraint_mass * residual, 0)
+        force = jnp.where(self.active(residual), -self.constraint_mass * residual, 0)
+        return force if self.loss is None else force + self.sliding(residual)
+
+    def sliding(self, residual: jax.Array) -> jax.Array:
+        """Returns the forces [rows] of the rows that slide, 0 for others."""
+        assert self.loss is not None
+        first = slice(self.loss.size)
+        slides = jnp.abs(self.constraint_mass[first] * residual[first]) >= self.loss
+        force = jnp.where(slides, -jnp.sign(residual[first]) * self.loss, 0)
+        return jnp.pad(force, (0, residual.size - self.loss.size))
+
+    def alike(self, one: jax.Array, other: jax.Array) -> jax.Array:
+        """Returns whether the cost is the same quadratic function [] at two residuals [rows]."""
+        same = self.active(one) == self.active(other)
+        if self.loss is not None:
+            same &= self.sliding(one) == self.sliding(other)
+        return jnp.all(same)
 
 
 class _Point(NamedTuple):
@@ -117,13 +140,9 @@ class _LineSearch(NamedTuple):
     settled: jax.Array
 
 
-def supports(model: mjx.Model, data: mjx.Data) -> bool:
-    """Returns whether ``solve_newton`` fits: Newton, pyramidal cones, no friction loss."""
-    return (
-        model.opt.solver == mjx.SolverType.NEWTON
-        and model.opt.cone == mjx.ConeType.PYRAMIDAL
-        and not jax_fields(data).nf
-    )
+def supports(model: mjx.Model) -> bool:
+    """Returns whether ``solve_newton`` fits: Newton, pyramidal cones."""
+    return model.opt.solver == mjx.SolverType.NEWTON and model.opt.cone == mjx.ConeType.PYRAMIDAL
 
 
 def solve_newton(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -140,14 +159,13 @@ def solve_newton(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array
       The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
     """
     fields = jax_fields(data)
-    equality = jnp.arange(fields.efc_D.shape[0]) < fields.ne
     num_others = fields.ne + fields.nf + fields.nl
     coupled = contact_rows.couplings(model)
     division = contact_rows.blocks(num_others, fields.contact.dim, coupled)
     # A NaN counts as touching, so that it gets to the acceleration.
     touching = ~(fields.contact.dist - fields.contact.includemargin >= 0)
     jacobian = contact_rows.with_bases(division, fields.efc_J, touching)
-    rows = Rows(jacobian, fields.efc_aref, fields.efc_D, equality)
+    rows = Rows(jacobian, fields.efc_aref, fields.efc_D, *_kinds(data))
     inertia = mjx.full_m(model, data)
 
     def along(direction: jax.Array) -> jax.Array:
@@ -168,7 +186,7 @@ def solve_newton(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array
             before.imbalance + length * change_of_imbalance,
             before.residual + length * change,
         )
-        same = jnp.all(rows.active(after.residual) == rows.active(before.residual))
+        same = rows.alike(after.residual, before.residual)
         settled = same | (decrement < smallest)
         return Search(after, search.steps + 1, settled)
 
@@ -185,6 +203,14 @@ def solve_newton(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array
     force = rows.force(end.residual)
     joint_force = contact_rows.weighted(division, inertia, rows.jacobian, force, force)[1]
     return end.qacc, joint_force, force
+
+
+def _kinds(data: mjx.Data) -> tuple[jax.Array, jax.Array | None]:
+    """Returns which rows [rows] are active on both sides, and ``Rows.loss``."""
+    fields = jax_fields(data)
+    first = fields.ne + fields.nf
+    loss = fields.efc_frictionloss[:first].at[: fields.ne].set(jnp.inf) if fields.nf else None
+    return jnp.arange(fields.efc_D.size) < first, loss
 
 
 def descend(model: mjx.Model, improve: Callable[[Search], Search], start: Any) -> Any:
@@ -205,6 +231,10 @@ def _cost(rows: Rows, data: mjx.Data, point: _Point) -> jax.Array:
     """Returns what is minimized, []."""
     active = rows.active(point.residual)
     penalty = jnp.sum(jnp.where(active, rows.constraint_mass * point.residual**2, 0))
+    if rows.loss is not None:
+        slides, first = rows.sliding(point.residual)[: rows.loss.size], slice(rows.loss.size)
+        beyond = 2 * jnp.abs(point.residual[first]) - rows.loss / rows.constraint_mass[first]
+        penalty += jnp.sum(jnp.where(slides != 0, rows.loss * beyond, 0))
     return (jnp.dot(point.imbalance, point.qacc - data.qacc_smooth) + penalty) / 2
 
 
@@ -241,16 +271,18 @@ def _line_search(
     row_slope = rows.constraint_mass * change * point.residual
     row_curvature = rows.constraint_mass * change**2
 
-    def line(active: jax.Array) -> Line:
-        return Line(
-            without_rows.at_zero + jnp.sum(jnp.where(active, row_slope, 0)),
-            without_rows.rate + jnp.sum(jnp.where(active, row_curvature, 0)),
-        )
+    def line(active: jax.Array, residual: jax.Array) -> Line:
+        at_zero = without_rows.at_zero + jnp.sum(jnp.where(active, row_slope, 0))
+        if rows.loss is not None:
+            at_zero -= jnp.dot(rows.sliding(residual), change)
+        return Line(at_zero, without_rows.rate + jnp.sum(jnp.where(active, row_curvature, 0)))
 
     def at(length: jax.Array) -> Line:
-        return line(rows.equality | (point.residual + length * change < 0))
+        residual = point.residual + length * change
+        pushes = rows.both_sides | (residual < 0)
+        return line(pushes if rows.loss is None else rows.active(residual), residual)
 
-    return root(line(rows.active(point.residual)), at, max_rounds)
+    return root(line(rows.active(point.residual), point.residual), at, max_rounds)
 
 
 def root(first: Line, at: Callable[[jax.Array], Line], max_rounds: int) -> jax.Array:
@@ -268,8 +300,9 @@ def root(first: Line, at: Callable[[jax.Array], Line], max_rounds: int) -> jax.A
     """
 
     def evaluate(last: _LineSearch) -> _LineSearch:
-        inside = (last.low < last.root) & (last.root < last.high)
-        length = jnp.where(inside, last.root, (last.low + last.high) / 2)
+        outside = (last.root <= last.low) | (last.root >= last.high)
+        length = jnp.where(outside, (last.low + last.high) / 2, last.root)
+        wide = last.low < _NARROW * last.high
         found = at(length)
         root = jnp.where(found.rate > 0, -found.at_zero / found.rate, length)
         moved = [(new < old) | (new > old) for new, old in zip(found, last.line, strict=True)]
@@ -279,7 +312,8 @@ def root(first: Line, at: Callable[[jax.Array], Line], max_rounds: int) -> jax.A
             root=root,
             line=found,
             evaluated=last.evaluated + 1,
-            settled=~jnp.any(jnp.stack(moved)),  # a NaN does not move
+            # In the middle of a wide interval, the last line's root may not be the derivative's.
+            settled=~((outside & wide) | jnp.any(jnp.stack(moved))),  # a NaN does not move
         )
 
     start = _LineSearch(
@@ -312,10 +346,10 @@ def solve_in_loops(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Arr
                 rows, residual, change = one
                 active = rows.active(residual + length * change)
                 weighted = jnp.where(active, rows.constraint_mass * change, 0)
-                return Line(
-                    line.at_zero + jnp.dot(weighted, residual),
-                    line.rate + jnp.dot(weighted, change),
-                ), None
+                at_zero = line.at_zero + jnp.dot(weighted, residual)
+                if rows.loss is not None:
+                    at_zero -= jnp.dot(rows.sliding(residual + length * change), change)
+                return Line(at_zero, line.rate + jnp.dot(weighted, change)), None
 
             return _fold(add, without_rows, groups, residuals, changes)[0]
 
@@ -323,8 +357,7 @@ def solve_in_loops(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Arr
 
         def compare(same: jax.Array, one: tuple) -> tuple[jax.Array, None]:
             rows, residual, change = one
-            after = rows.active(residual + length * change)
-            return same & jnp.all(after == rows.active(residual)), None
+            return same & rows.alike(residual + length * change, residual), None
 
         same, _ = _fold(compare, jnp.array(True), groups, residuals, changes)
         after = qacc + length * direction, imbalance + length * change_of_imbalance
@@ -350,10 +383,11 @@ def _rows_by_contact(model: mjx.Model, data: mjx.Data) -> list[Rows]:
     fields = jax_fields(data)
     others = fields.ne + fields.nf + fields.nl
     division = contact_rows.blocks(others, fields.contact.dim, contact_rows.couplings(model))
-    equality = jnp.arange(fields.efc_D.size) < fields.ne
-    rows = fields.efc_J, fields.efc_aref, fields.efc_D, equality
+    both_sides, loss = _kinds(data)
+    rows = fields.efc_J, fields.efc_aref, fields.efc_D, both_sides
     contacts = zip(*(contact_rows.by_group(division, x) for x in rows), strict=True)
-    return [Rows(*(x[None, :others] for x in rows)), *(Rows(*each) for each in contacts)]
+    first = Rows(*(x[None, :others] for x in rows), loss=None if loss is None else loss[None])
+    return [first, *(Rows(*each) for each in contacts)]
 
 
 def _fold(step: Callable, start: Any, *groups: Sequence) -> tuple[Any, list]:
@@ -389,8 +423,13 @@ def _direction_in_loops(
         def pushed() -> tuple:
             hessian, gradient = sums
             weighted = rows.jacobian.T * mass
-            return hessian + weighted @ rows.jacobian, gradient + weighted @ residual
+            slope = gradient + weighted @ residual
+            if rows.loss is not None:
+                slope -= rows.jacobian.T @ rows.sliding(residual)
+            return hessian + weighted @ rows.jacobian, slope
 
+        if rows.loss is not None:  # all rows may slide
+            return pushed(), residual
         return skippable(jnp.any(mass != 0), pushed, sums), residual
 
     (hessian, gradient), residuals = _fold(add, (inertia, imbalance), groups)

@@ -25,7 +25,7 @@ also where no constraint is active. Two cases are cheaper and lead to the same a
 - Otherwise the solver is entered only if some row is active; if none is, the acceleration is the
   unconstrained one. (Under ``jax.vmap`` both branches are computed for every episode.) For all of
   Gymnasium's tasks with contacts the solver is ``newton``, whose line search is exact; MJX's own
-  remains for elliptic cones, friction loss and conjugate gradients.
+  remains for elliptic cones and conjugate gradients.
 
 The model's solver options stay as they are. The closed form is exact and reads none of
 ``iterations``, ``tolerance`` and the warm start. C's Newton solver also stops at a small gradient
@@ -143,7 +143,7 @@ def _solve_in_steps(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Ar
     """
     if not jax_fields(data).contact.dim.size:  # MJX's solver fails on elliptic cones of none
         model = model.replace(opt=model.opt.replace(cone=mjx.ConeType.PYRAMIDAL))
-    if newton.supports(model, data):
+    if newton.supports(model):
         return touching.solve_touching(newton.solve_newton, model, data)
     data = mjx.solve(model, data)
     return data.qacc, data.qfrc_constraint, jax_fields(data).efc_force
