@@ -190,13 +190,10 @@ def refusal(parts: Sequence[Mechanism]) -> str:
 
 
 def programs(chosen: Sequence[Mechanism]) -> Iterator[list[Mechanism]]:
-    """Yields mechanisms that one model has: of one axis, one option and one solver."""
+    """Yields mechanisms that one model has: of one axis and one option."""
     groups: dict[Any, list[Mechanism]] = {}
     for each in chosen:
-        # Rows of friction lead to another solver, which flags do not change.
-        other = "frictionloss" in each.xml and each.axis != "flags"
-        key = each.axis, each.case, each.option, other
-        groups.setdefault(key, []).append(each)
+        groups.setdefault((each.axis, each.case, each.option), []).append(each)
     for group in groups.values():
         size = len(group) if group[0].axis == "actuators" else BITS
         yield from (group[i : i + size] for i in range(0, len(group), size))

@@ -245,10 +245,9 @@ def peers(path: Path) -> dict[tuple[str, str, str], dict[float, list[float]]]:
 
 
 class Figure(NamedTuple):
-    """A published figure: a mean return, who reached it, and with how many env steps."""
+    """A published figure: a mean return, and with how many env steps it was reached."""
 
     mean: float
-    source: str
     env_steps: float
 
 
@@ -259,4 +258,4 @@ def published(path: Path, task: str, algorithm: str) -> Figure | None:
     if not rows:
         return None
     best = max(rows, key=lambda row: float(row["mean"]))
-    return Figure(float(best["mean"]), best["implementation"], float(best["env_steps"]))
+    return Figure(float(best["mean"]), float(best["env_steps"]))

@@ -170,15 +170,15 @@ def _peer(budgets: dict[float, list[float]]) -> str:
     return cells if budgets else "not run"
 
 
-def compare(ours: ArrayLike, theirs: ArrayLike) -> tuple[Estimate, Estimate, Estimate]:
-    """Returns the means of returns [N] in two simulations, and theirs less ours, by Welch."""
+def compare(ours: ArrayLike, theirs: ArrayLike) -> Estimate:
+    """Returns by how much the mean of their returns [N] is above that of ours, by Welch."""
     ours, theirs = np.asarray(ours, float), np.asarray(theirs, float)
     difference = float(theirs.mean() - ours.mean())
     low = high = difference
     if ours.std() > 0 or theirs.std() > 0:
         welch = stats.ttest_ind(theirs, ours, equal_var=False).confidence_interval(0.95)
         low, high = float(welch.low), float(welch.high)
-    return estimate_mean(ours), estimate_mean(theirs), Estimate(difference, low, high)
+    return Estimate(difference, low, high)
 
 
 def play(played: Mapping[str, Columns], docs: Path) -> str:
@@ -188,13 +188,12 @@ def play(played: Mapping[str, Columns], docs: Path) -> str:
         for policy in POLICIES:
             mine, ours = columns["policy"] == policy, columns["simulation"] == "ours"
             returns = columns["return"]
-            found = compare(returns[mine & ours], returns[mine & ~ours])
+            both = returns[mine & ours], returns[mine & ~ours]
             film = Path("films", f"{task}-{policy}.gif")
             shown = f"[video]({film.as_posix()})" if (docs / film).exists() else ""
             label = f"{policy} ({columns['seed'][mine][0]})"
-            *means, difference = found
-            means = [number(x.value) for x in means]
-            rows.append([task, label, *means, estimate(difference), shown])
+            means = (number(x.mean()) for x in both)
+            rows.append([task, label, *means, estimate(compare(*both)), shown])
     header = ["task", "policy (seed)", "here", "Gymnasium", "Gymnasium less here", "video"]
     return table(header, rows)
 
