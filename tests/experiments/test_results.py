@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.studies.results import __main__ as results
-from experiments.studies.results import kept, runs
+from experiments.studies.results import kept, runs, tables
 from experiments.studies.results.tasks import TASKS, settings_of
 from mjx_reinforce.files import write_json
 from mjx_reinforce.runs import command_line
@@ -60,8 +60,7 @@ def folder(tmp_path):
 def test_returns_are_those_after_a_minute_and_at_the_end(folder):
     gpu, cpu = kept.clock(folder / "kept")
     assert (gpu.device, cpu.device) == ("NVIDIA X", "zen, 2 of 8 threads")
-    np.testing.assert_array_equal(gpu.minute, [4, 8])
-    np.testing.assert_array_equal(gpu.final, [11, 21])
+    np.testing.assert_array_equal([gpu.minute, gpu.final], [[4, 8], [11, 21]])
     np.testing.assert_array_equal(cpu.minute, [5, 7])
     np.testing.assert_array_equal(cpu.final, [6.5, 9])  # the last evaluation of what was stopped
     assert (gpu.seconds, gpu.env_steps, gpu.stopped, cpu.stopped) == (90, 90000, False, True)
@@ -110,6 +109,7 @@ def test_the_tables_of_both_pages(folder):
     pendulum = "<!-- pendulum -->\n<!-- end -->\n"
     (docs / "results.md").write_text(marks + pendulum)
     (folder / "README.md").write_text("Before.\n<!-- results -->\nwas here\n<!-- end -->\nAfter.\n")
+    assert tables.published_interval(10, 1).high == pytest.approx(10.7154, abs=1e-4)  # Student's
     results.write(data, docs, folder / "README.md")
     page, readme = (docs / "results.md").read_text(), (folder / "README.md").read_text()
     for line in (
