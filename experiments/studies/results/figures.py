@@ -8,9 +8,9 @@ from experiments.kit.pictures import save_picture
 from experiments.studies.results import kept
 from experiments.studies.results.tables import PEERS
 
-#: Blue and vermilion for the machines, black and grey for others.
-_GPU, _CPU, _PEER = "#0072b2", "#d55e00", "#777777"
-_COLUMNS = 4
+#: A word of the device -> vermilion for CPUs, two blues for GPUs; the first that fits counts.
+_COLORS = {"threads": "#d55e00", "H200": "#56b4e9", "": "#0072b2"}
+_PEER = "#777777"
 
 
 def draw(folder: Path, docs: Path, path: Path) -> None:
@@ -26,13 +26,13 @@ def draw(folder: Path, docs: Path, path: Path) -> None:
 
     found, others = kept.curves(folder), kept.peers(docs / "peers.csv")
     tasks = list(dict.fromkeys(group.task for group in kept.clock(folder)))
-    rows = -(-len(tasks) // _COLUMNS)
+    rows = -(-len(tasks) // 4)
     figure = Figure(figsize=(13.4, 0.6 + 2.7 * rows), dpi=100, layout="constrained")
     for number, task in enumerate(tasks, 1):
-        ax = figure.add_subplot(rows, _COLUMNS, number)
+        ax = figure.add_subplot(rows, 4, number)
         for (name, device), curve in found.items():
             if name == task:
-                color = _CPU if "threads" in device else _GPU
+                color = next(color for word, color in _COLORS.items() if word in device)
                 band = (curve["seconds"], curve["low"], curve["high"])
                 ax.fill_between(*band, color=color, alpha=0.25)
                 ax.plot(curve["seconds"], curve["mean"], color=color)
@@ -42,8 +42,7 @@ def draw(folder: Path, docs: Path, path: Path) -> None:
         for (name, peer, _), budgets in others.items():
             if name == task and peer in PEERS:
                 means = [np.mean(values) for values in budgets.values()]
-                marker = "os"[PEERS.index(peer)]
-                ax.plot(list(budgets), means, marker, color=_PEER, markersize=5)
+                ax.plot(list(budgets), means, "os"[PEERS.index(peer)], color=_PEER, markersize=5)
         ax.set(title=task, xlabel="seconds of training")
         ax.set_xscale("log", subs=[2, 5])
         ax.xaxis.set_major_formatter("{x:g}")
@@ -51,13 +50,14 @@ def draw(folder: Path, docs: Path, path: Path) -> None:
         ax.tick_params(axis="x", which="both", labelsize=8)
     figure.axes[0].set_ylabel("return without noise")
     shown = {
-        "one GPU, all seeds together": Line2D([], [], color=_GPU),
-        "two threads, one seed": Line2D([], [], color=_CPU),
+        "one H100": Line2D([], [], color=_COLORS[""]),
+        "one H200, some shared": Line2D([], [], color=_COLORS["H200"]),
+        "two CPU threads": Line2D([], [], color=_COLORS["threads"]),
         "PPO, published": Line2D([], [], color="black", linestyle="--"),
         "SAC, published": Line2D([], [], color="black", linestyle=":"),
         "Stable-Baselines3 PPO": Line2D([], [], color=_PEER, marker="o", linestyle=""),
         "and SAC, two threads": Line2D([], [], color=_PEER, marker="s", linestyle=""),
     }
-    figure.legend(shown.values(), shown, loc="outside lower center", ncols=6, frameon=False)
+    figure.legend(shown.values(), shown, loc="outside lower center", ncols=7, frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_picture(figure, path)
