@@ -68,10 +68,8 @@ def test_the_best_of_several_runs_is_packed(tmp_path):
 
 def test_the_command_gives_the_settings_again():
     config = of_task("CartPole-v1", 7000, 5)
-    written = json.loads(json.dumps(vars(config))) | {
-        "standardize_floor": None,
-        "hidden_sizes": [8, 4],
-    }
+    own = {"standardize_floor": None, "hidden_sizes": [8, 4], "value_fits": 3}  # the last unread
+    written = json.loads(json.dumps(vars(config))) | own
     line = shlex.split(pretrained.command(written))
     assert line[:3] == ["python", "-m", "mjx_reinforce.train"]
     again = command_line.parse(line[3:]).base

@@ -3,7 +3,8 @@
 ``of_tasks`` are the runs that ``train`` made: TASK.json has a run's settings, machine and times,
 TASK-seeds.csv a row for each seed. ``clock`` are runs that were given a time: seconds.csv has a row
 for each seed, seconds-curves.csv the mean over the seeds of a task on a machine, at times on a
-logarithmic grid, seconds-play-TASK.csv the episodes that ``play`` played of them.
+logarithmic grid, seconds-play-TASK.csv the episodes that ``play`` played of them. kl_limit.csv are
+the curves of the report that docs/scale.md shows.
 """
 
 import itertools

@@ -18,7 +18,7 @@ from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.export.policy_files import Player, SavedPolicy, load_seed, save_policy
 from mjx_reinforce.export.run_files import PROVENANCE_FILE, Run, read_run
 from mjx_reinforce.files import read_json, write_json
-from mjx_reinforce.settings.config import as_words
+from mjx_reinforce.settings.config import as_words, changed, is_read
 from mjx_reinforce.settings.defaults import of_task
 
 #: Roots of the starts on which policies are compared, and of those on which the best is measured.
@@ -135,18 +135,16 @@ def _provenance(best: Candidate, returns: np.ndarray) -> dict[str, Any]:
 
 
 def command(written: dict[str, Any]) -> str:
-    """Returns the command line that trains a run again: what is not the task's default.
+    """Returns the command line that trains a run again: what it reads and no default says.
 
     Args:
       written: of the run's config.json.
     """
-    env = written["env"]
-    default = dataclasses.asdict(of_task(env, written["env_steps"], written["num_seeds"]))
-    words = ["python", "-m", "mjx_reinforce.train", "--env", env]
-    for name in default:
-        value, always = written.get(name, default[name]), name in ("env_steps", "num_seeds", "seed")
-        plain = list(default[name]) if isinstance(default[name], tuple) else default[name]
-        if name in _NOT_SAID or (value == plain and not always):
-            continue
-        words += as_words(name, value)
+    default = of_task(written["env"], written["env_steps"], written["num_seeds"])
+    known = {k: tuple(v) if isinstance(v, list) else v for k, v in written.items()}
+    config = dataclasses.replace(default, **{k: known[k] for k in vars(default) if k in known})
+    words = ["python", "-m", "mjx_reinforce.train", "--env", config.env]
+    for name in dict.fromkeys((*changed(config, default), "num_seeds", "seed", "env_steps")):
+        if name not in _NOT_SAID and is_read(name, config):
+            words += as_words(name, getattr(config, name))
     return shlex.join(words)
