@@ -13,7 +13,7 @@ import numpy as np
 from mujoco import MjModel, MjSpec, mjx  # pyright: ignore[reportAttributeAccessIssue]
 
 from mjx_reinforce.engine.checks import explain
-from mjx_reinforce.engine.physics.contacts import UNLIKE_C
+from mjx_reinforce.engine.physics import contacts
 from mjx_reinforce.engine.physics.mjx_internals import geom_pairs
 
 #: MuJoCo's own names; it is a C extension without stubs.
@@ -166,7 +166,7 @@ def replaced(episode: dict[str, Any]) -> dict[str, Any]:
 
 def make_data(model: "mjx.Model") -> mjx.Data:
     """Returns MJX's simulation of a model at its start, on this process's own device."""
-    return mjx.make_data(model, impl="jax", device=jax.local_devices()[0])
+    return contacts.make_data(model, jax.local_devices()[0])
 
 
 def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
@@ -189,11 +189,12 @@ def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
     try:
         for *geoms, pair in geom_pairs(model):
             kinds = tuple(mjx.GeomType(kind) for kind in model.geom_type[geoms])
-            if kinds in UNLIKE_C:
-                raise NotImplementedError(f"{kinds} collisions, which MJX gets wrong")
+            names = " on ".join(kind.name.lower() for kind in reversed(kinds))
             margin = model.geom_margin[geoms].sum() if pair < 0 else model.pair_margin[pair]
-            if kinds[1] == mjx.GeomType.BOX and kinds[0] != mjx.GeomType.PLANE and margin:
-                raise NotImplementedError(f"{kinds} margin/gap, which MJX ignores")
+            if kinds in contacts.UNLIKE_C:
+                raise NotImplementedError(f"collisions of {names}, {contacts.UNLIKE_C[kinds]}")
+            if kinds in contacts.UNLIKE_C_WITHIN_MARGIN and margin:
+                raise NotImplementedError(f"{names} with margin/gap, which MJX ignores")
         # Not on JAX's first device, which may be another process's.
         converted = mjx.put_model(model, impl="jax", device=jax.local_devices()[0])
         # Notices what the model alone does not show; its arrays are not made.

@@ -25,6 +25,8 @@ def _mjcf(template: str, **parts: str) -> str:
     return _TABLES["templates"][template].format_map(defaultdict(str, said))
 
 
+#: A mesh and a height field.
+ASSETS = _LISTS["assets"]
 #: What moves beside the mechanisms of a program.
 MOTOR = _mjcf("arm")
 #: Name -> MJCF.

@@ -9,9 +9,10 @@ change an episode. Those here agree with MuJoCo 4.0 to rounding, with exceptions
   lowest, and the far end of a cylinder whose end is more than 1 mm deeper.
 - ``sphere_capsule`` and ``capsule_capsule``: MJX adds 1e-6 to its denominators.
 - ``sphere_cylinder`` and ``capsule_cylinder``: MJX looks for their contacts in ten steps of
-  gradient descent. So it does for the pairs of ``UNLIKE_C``, which ``envs/models.py`` refuses.
+  gradient descent.
+- Boxes on spheres, capsules and boxes: see ``boxes.py``.
 
-These differences remain:
+``envs/models.py`` refuses the pairs of ``UNLIKE_C``. These differences remain:
 
 - Capsules within 1e-4 rad of parallel meet in two contacts in C, at the ends of their overlap, and
   here in one, at its middle: the number of rows is static in JAX, so that every pair of capsules
@@ -22,6 +23,8 @@ These differences remain:
   axis enters the cylinder is pushed out by the shortest way of its deepest point, and in C of the
   whole capsule. Of a capsule that lies on a cap with one end beyond the margin, C doubles the
   contact at the other end if the rim cuts it.
+- Where a capsule is parallel to a face of a box but for rounding, the sign of the rounding decides
+  whether C finds one contact or two.
 
 ``fwd_position`` is MJX's with these functions in the table of collision functions. MJX collides all
 pairs of one kind at once, which is best where XLA computes many episodes. Machine code for one
@@ -39,7 +42,7 @@ import numpy as np
 from jax import lax
 from mujoco import mjx
 
-from mjx_reinforce.engine.physics import inertia, mjx_internals
+from mjx_reinforce.engine.physics import boxes, inertia, mjx_internals
 from mjx_reinforce.engine.physics.mjx_internals import Collision, GeomInfo, collider, make_frame
 from mjx_reinforce.engine.physics.rows import make_constraint
 from mjx_reinforce.engine.scalar import is_written_out, short_scan
@@ -78,22 +81,18 @@ def plane_box(plane: GeomInfo, box: GeomInfo) -> Collision:
     return _collide_points(plane, box.pos + jnp.where(up[:, None], -corners, corners))
 
 
-@collider(ncon=3)
+@collider(ncon=4)
 def plane_cylinder(plane: GeomInfo, cylinder: GeomInfo) -> Collision:
-    """Collides a plane with a cylinder's lowest point and with two more.
-
-    They are two of the lower rim, a third around, or the lowest of the other rim if it is lower: C
-    has that one in addition, which matters only where all four are within the margin.
+    """Collides a plane with a cylinder's lowest point, two more of its rim, a third around, and
+    the lowest of the other rim.
     """
     normal, axis = plane.mat[:, 2], cylinder.mat[:, 2]
     axis = jnp.where(jnp.dot(normal, axis) > 0, -axis, axis)
     down, length = _direction(axis * jnp.dot(axis, normal) - normal)
     down = cylinder.size[0] * jnp.where(length == 0, cylinder.mat[:, 0], down)
     across, half = jnp.cross(down, axis) * np.sqrt(0.75), cylinder.size[1] * axis
-    rim = half + jnp.stack([down, across - down / 2, -across - down / 2])
-    other = down - half
-    lower = jnp.dot(other, normal) < jnp.dot(rim[1], normal)
-    return _collide_points(plane, cylinder.pos + rim.at[1].set(jnp.where(lower, other, rim[1])))
+    rims = jnp.stack([half + down, half + across - down / 2, half - across - down / 2, down - half])
+    return _collide_points(plane, cylinder.pos + rims)
 
 
 @collider(ncon=1)
@@ -305,22 +304,45 @@ _OURS = {
     (mjx.GeomType.CAPSULE, mjx.GeomType.CAPSULE): capsule_capsule,
     (mjx.GeomType.SPHERE, mjx.GeomType.CYLINDER): sphere_cylinder,
     (mjx.GeomType.CAPSULE, mjx.GeomType.CYLINDER): capsule_cylinder,
+    (mjx.GeomType.SPHERE, mjx.GeomType.BOX): boxes.sphere_box,
+    (mjx.GeomType.CAPSULE, mjx.GeomType.BOX): boxes.capsule_box,
+    (mjx.GeomType.BOX, mjx.GeomType.BOX): boxes.box_box,
 }
-#: Pairs of types of geoms, in MJX's order, whose contacts MJX finds at other places than C.
-UNLIKE_C = {
-    (mjx.GeomType.SPHERE, mjx.GeomType.ELLIPSOID),
-    (mjx.GeomType.CAPSULE, mjx.GeomType.ELLIPSOID),
-    (mjx.GeomType.ELLIPSOID, mjx.GeomType.ELLIPSOID),
-    (mjx.GeomType.ELLIPSOID, mjx.GeomType.CYLINDER),
-    (mjx.GeomType.CYLINDER, mjx.GeomType.CYLINDER),
+_SEARCHED = "which MJX finds in ten steps of a search"
+_FEWER = "of which MJX finds fewer points than C MuJoCo, in other places"
+_OF_MESHES = "SPHERE MESH, CAPSULE MESH, BOX MESH, MESH MESH, PLANE MESH"
+_OF_FIELDS = "HFIELD SPHERE, HFIELD CAPSULE, HFIELD BOX, HFIELD MESH"
+_OF_ELLIPSOIDS = "SPHERE ELLIPSOID, CAPSULE ELLIPSOID, ELLIPSOID ELLIPSOID, ELLIPSOID CYLINDER"
+
+
+def _pairs(names: str) -> list[tuple[mjx.GeomType, ...]]:
+    """Returns pairs of types of geoms."""
+    return [tuple(mjx.GeomType[x] for x in pair.split()) for pair in names.split(", ")]
+
+
+#: Pairs of types of geoms, in MJX's order, whose contacts MJX finds at other places than C, and how.
+#: ``python -m experiments.checks.contacts`` compares all others with C.
+UNLIKE_C: dict[tuple[mjx.GeomType, ...], str] = {
+    **dict.fromkeys(_pairs(f"{_OF_ELLIPSOIDS}, CYLINDER CYLINDER"), _SEARCHED),
+    **dict.fromkeys(_pairs(f"{_OF_MESHES}, {_OF_FIELDS}"), _FEWER),
 }
-_ROUND_GEOMS = {mjx.GeomType.SPHERE, mjx.GeomType.CAPSULE, mjx.GeomType.CYLINDER}
-_collision = mjx_internals.collision_with(
-    lambda table: {
-        pair: one_by_one(function) if set(pair) <= _ROUND_GEOMS else function
+#: Those that are like C's only without a margin: C leaves out contacts of boxes that an edge keeps
+#: apart by more, and a collision function does not know the margin.
+UNLIKE_C_WITHIN_MARGIN = frozenset(_pairs("BOX BOX"))
+_SOLID_GEOMS = {getattr(mjx.GeomType, x) for x in ("SPHERE", "CAPSULE", "CYLINDER", "BOX")}
+
+
+def _functions(table: dict[Any, Collide]) -> dict[Any, Collide]:
+    """Returns the collision functions: MJX's, and in their place ours."""
+    return {
+        pair: one_by_one(function) if set(pair) <= _SOLID_GEOMS else function
         for pair, function in (table | _OURS).items()
     }
-)
+
+
+#: ``mjx.collision`` and ``mjx.make_data`` with this module's contacts.
+collision = mjx_internals.collision_with(_functions)
+make_data = mjx_internals.data_with(_functions)
 
 
 def fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -332,6 +354,6 @@ def fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = mjx.crb(model, data)
     data = inertia.tendon_armature(model, data)
     data = mjx.factor_m(model, data)
-    data = _collision(model, data)
+    data = collision(model, data)
     data = make_constraint(model, data)
     return mjx.transmission(model, data)

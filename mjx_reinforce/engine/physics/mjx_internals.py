@@ -5,8 +5,9 @@ No other file imports MJX's private modules or reads the private part of its dat
 - Names that MJX keeps private, here without underscore: the imports, and ``advance``.
 - Fields of ``mjx.Data`` that only MJX's JAX implementation has: ``jax_fields``, ``with_fields``,
   ``rows_of``, ``with_rows``, ``with_contact``, ``Simulation``.
-- Functions of MJX in which a name is given another meaning: ``collision_with`` and ``fenced``. They
-  would do nothing, silently, if MJX stopped looking that name up; ``check_lookup`` raises then.
+- Functions of MJX in which a name is given another meaning: ``collision_with``, ``data_with`` and
+  ``fenced``. They would do nothing, silently, if MJX stopped looking that name up; ``check_lookup``
+  raises then.
 
 ``tests/engine/physics/test_mjx_internals.py`` holds a hash of each MJX function that this package
 replaces or whose source it depends on: a new MJX fails there first.
@@ -32,6 +33,7 @@ from mujoco.mjx._src import (
     collision_primitive,
     collision_types,
     forward,
+    io,
     math,
     scan,
     smooth,
@@ -69,6 +71,8 @@ def check_lookup(function: Callable[..., Any], name: str) -> None:
 
 
 check_lookup(mjx.collision, "_COLLISION_FUNC")
+check_lookup(collision_driver.make_condim, "_COLLISION_FUNC")
+check_lookup(io._make_data_jax, "collision_driver")
 check_lookup(scan.flat, "_nvmap")
 check_lookup(scan.body_tree, "_nvmap")
 
@@ -98,6 +102,22 @@ def collision_with(
     plain = inspect.unwrap(mjx.collision)
     table = functions(dict(collision_driver._COLLISION_FUNC))
     return types.FunctionType(plain.__code__, {**plain.__globals__, "_COLLISION_FUNC": table})
+
+
+def data_with(functions: Callable[[_Colliders], _Colliders]) -> Callable[..., mjx.Data]:
+    """Returns a copy of ``mjx.make_data`` that has room for the contacts of ``collision_with``.
+
+    Args:
+      functions: as in ``collision_with``.
+
+    Returns:
+      (model, device) -> data
+    """
+    table, names = functions(dict(collision_driver._COLLISION_FUNC)), collision_driver.__dict__
+    plain, make = collision_driver.make_condim, io._make_data_jax
+    room = types.FunctionType(plain.__code__, {**names, "_COLLISION_FUNC": table})
+    driver = types.SimpleNamespace(make_condim=room)
+    return types.FunctionType(make.__code__, {**make.__globals__, "collision_driver": driver})
 
 
 _lock = threading.RLock()
