@@ -1,10 +1,10 @@
 """Contacts of two geoms in many poses, ours beside C MuJoCo's.
 
 Poses are crossed from how large the geoms are, how they are turned, and where the second is: apart,
-touching at faces, edges and corners, one longer than, inside, or across the other, coaxial, parallel
-and nearly so. Compared are the number of contacts nearer than the margin, and the distance, place and
-frame of each. Where C's own contacts change when it moves the second geom by 1e-11, nothing is
-compared: such poses are counted as undecided.
+touching at faces, edges and corners, one longer than, inside, or across the other, coaxial,
+parallel and nearly so. Compared are the number of contacts nearer than the margin, and the
+distance, place and frame of each. Where C's own contacts change when it moves the second geom by
+rounding or by 1e-11, nothing is compared: such poses are counted as undecided.
 """
 
 import csv
@@ -20,7 +20,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from mujoco import mjx
 from scipy.spatial.transform import Rotation
 
 from experiments.checks.mechanisms import ASSETS
@@ -149,7 +148,7 @@ class TwoGeoms:
 
 def _bound(kind: str, size: np.ndarray) -> float:
     """Returns the radius of a geom's bounding sphere, 0 for a plane."""
-    x, y, z = size
+    x, y, _ = size
     sphere, capsule, cylinder = x, x + y, np.hypot(x, y)
     bounds = {"sphere": sphere, "capsule": capsule, "cylinder": cylinder, "plane": 0}
     bounds |= {"ellipsoid": max(size), "box": np.linalg.norm(size)}
@@ -157,7 +156,7 @@ def _bound(kind: str, size: np.ndarray) -> float:
 
 
 def error(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Returns the largest difference of contacts [K, 13], in any order; infinite if more or fewer."""
+    """Returns the largest difference of contacts [K, 13] in any order, infinite if more or fewer."""
     if len(ours) != len(theirs):
         return np.inf
     rest, worst = list(ours), 0.0
@@ -199,12 +198,25 @@ def _size(kind: str, half: Any) -> np.ndarray:
     return np.array([x, 0, 0]) if kind == "sphere" else np.array([x, y, z])
 
 
-def draw(geoms: TwoGeoms, family: tuple[str, str, str], rng: np.random.Generator) -> Pose:
-    """Returns a pose of a family: of how large the geoms are, how turned, and where."""
+def draw(
+    geoms: TwoGeoms,
+    family: tuple[str, str, str],
+    rng: np.random.Generator,
+    sized: np.ndarray | None = None,
+) -> Pose:
+    """Returns a pose of a family: of how large the geoms are, how turned, and where.
+
+    Args:
+      geoms: the geoms.
+      family: the names of their sizes, of how they are turned, and of where they are.
+      rng: what is drawn from.
+      sized: MuJoCo's sizes [2, 3] in place of drawn ones.
+    """
     sizes, turn, place = family
     halves = np.array(_SIZES[sizes]) * rng.uniform(0.9, 1.1, (2, 3))
     halves = halves[:: rng.choice([1, -1])]
     size = np.stack([_size(*x) for x in zip(geoms.kinds, halves, strict=True)])
+    size = size if sized is None else sized
     axis = np.eye(3)[rng.integers(3)] * rng.choice([-1, 1])
     direction = axis if place in ("beside", "coaxial") else rng.normal(size=3)
     endless = geoms.kinds[0] in ("plane", "hfield")
@@ -245,7 +257,7 @@ def outcomes(geoms: TwoGeoms, number: int, seed: int) -> Iterator[Outcome]:
     for family, pose, ours in zip(families, poses, found, strict=True):
         theirs = geoms.by_c(pose)
         wrong = error(ours, theirs)
-        again = [geoms.by_c(x) for x in (*moved(pose, rng), *moved(pose, rng))]
+        again = [geoms.by_c(x) for _ in range(3) for x in moved(pose, rng)]
         decided = all(error(x, theirs) < EQUAL for x in again)
         yield Outcome(", ".join(family), pose, wrong, decided, bool(len(theirs)))
 

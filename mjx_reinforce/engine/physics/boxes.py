@@ -2,8 +2,8 @@
 
 MJX's answers are others: a capsule that is longer than a box or inside it has one contact more or
 less, and two boxes have at most four contacts instead of eight. These functions compute C's
-(``mjc_SphereBox``, ``mjc_CapsuleBox`` and ``mjc_BoxBox``) without branches. A vector of booleans with
-at most one True chooses among the entries of another (``_chosen``).
+(``mjc_SphereBox``, ``mjc_CapsuleBox`` and ``mjc_BoxBox``) without branches. A vector of booleans
+with at most one True chooses among the entries of another (``_chosen``).
 """
 
 import jax
@@ -37,7 +37,7 @@ def _first_least(values: jax.Array) -> jax.Array:
 
 @collider(ncon=1)
 def sphere_box(sphere: GeomInfo, box: GeomInfo) -> Collision:
-    """Collides a sphere with the nearest point of a box; its center inside, with the nearest face."""
+    """Collides a sphere with a box at its nearest point, or nearest face if its center is inside."""
     center = (sphere.pos - box.pos) @ box.mat
     return _ball_on_box(center, sphere.size[0], box)
 

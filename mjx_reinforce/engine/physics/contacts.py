@@ -83,8 +83,9 @@ def plane_box(plane: GeomInfo, box: GeomInfo) -> Collision:
 
 @collider(ncon=4)
 def plane_cylinder(plane: GeomInfo, cylinder: GeomInfo) -> Collision:
-    """Collides a plane with a cylinder's lowest point, two more of its rim, a third around, and
-    the lowest of the other rim.
+    """Collides a plane with three points of a cylinder's lower rim, and the lowest of the other.
+
+    The three are the lowest, and those that are a third around.
     """
     normal, axis = plane.mat[:, 2], cylinder.mat[:, 2]
     axis = jnp.where(jnp.dot(normal, axis) > 0, -axis, axis)
@@ -320,7 +321,7 @@ def _pairs(names: str) -> list[tuple[mjx.GeomType, ...]]:
     return [tuple(mjx.GeomType[x] for x in pair.split()) for pair in names.split(", ")]
 
 
-#: Pairs of types of geoms, in MJX's order, whose contacts MJX finds at other places than C, and how.
+#: Pairs of types of geoms, in MJX's order, whose contacts are at other places than C's, and how.
 #: ``python -m experiments.checks.contacts`` compares all others with C.
 UNLIKE_C: dict[tuple[mjx.GeomType, ...], str] = {
     **dict.fromkeys(_pairs(f"{_OF_ELLIPSOIDS}, CYLINDER CYLINDER"), _SEARCHED),

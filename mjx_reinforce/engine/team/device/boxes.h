@@ -80,7 +80,7 @@ struct OnBox {
 };
 DEV OnBox along_box(const real* size, const real* center, const real* axis, real half) {
   real best = real(1e30), first = 0, on_edge = 0, reach[3];
-  int face = -1, edge = -1, corner = 0, toward = 0;
+  int face = -1, edge = -1, side = 0, corner = 0, toward = 0;
   for (int k = 0; k < 3; k++) {
     reach[k] = half * axis[k];
     toward |= int(reach[k] > 0) << k;
@@ -95,28 +95,35 @@ DEV OnBox along_box(const real* size, const real* center, const real* axis, real
     }
     if (out <= 1 && square < best) best = square, first = real(end), face = which;
   }
-  const Quad middle = {center[0], center[1], center[2], 0}, along = {axis[0], axis[1], axis[2], 0};
   LOOP for (int n = 0; n < 12; n++) {  // an edge: of direction j, at the signs that i's bits say
     const int j = n / 4, low = n % 4 & ((1 << j) - 1), i = n % 4 >> j << (j + 1) | low;
-    const real square_of_sine = 1 - axis[j] * axis[j], lengths = size[j] * half;
-    if (lengths * lengths * square_of_sine < PARALLEL) continue;
-    Quad from, direction;
-    for (int k = 0; k < 3; k++) {
-      from.x[k] = k == j ? real(0) : i >> k & 1 ? size[k] : -size[k];
-      direction.x[k] = k == j;
+    real offset[3], square = 0;
+    for (int k = 0; k < 3; k++)
+      offset[k] = (k == j ? real(0) : i >> k & 1 ? size[k] : -size[k]) - center[k];
+    const real edge_square = size[j] * size[j], axis_square = half * half;
+    const real both = -size[j] * reach[j], by_edge = -size[j] * offset[j];
+    const real by_axis = dot(reach, offset), determinant = edge_square * axis_square - both * both;
+    if (fabs(determinant) < PARALLEL) continue;
+    real on_a = (axis_square * by_edge - both * by_axis) / determinant;
+    real on_b = (edge_square * by_axis - both * by_edge) / determinant;
+    int end = fabs(on_a) > 1 ? (on_a > 0 ? 1 : -1) : 0;
+    if (end) on_a = real(end), on_b = (by_axis - both * on_a) / axis_square;
+    if (fabs(on_b) > 1) {
+      on_b = clip(on_b, real(-1), real(1));
+      on_a = (by_edge - both * on_b) / edge_square;
+      if (fabs(on_a) > 1) end = on_a > 0 ? 1 : -1, on_a = real(end);
     }
-    real on_a, on_b, square = 0;
-    closest(from, direction, size[j], middle, along, half, on_a, on_b);
     for (int k = 0; k < 3; k++) {
-      const real d = from.x[k] + on_a * direction.x[k] - center[k] - on_b * axis[k];
+      const real d = offset[k] - on_b * reach[k] + (k == j ? size[j] * on_a : real(0));
       square += d * d;
     }
     if (square < best - real(1e-15)) {
       best = square;
-      first = on_b / half;
-      on_edge = on_a / size[j];
+      first = on_b;
+      on_edge = on_a;
       edge = j;
-      corner = i | int(on_a >= size[j]) << j;
+      side = end;
+      corner = i | int(end > 0) << j;
     }
   }
   OnBox found = {first, 0, false};
@@ -132,7 +139,7 @@ DEV OnBox along_box(const real* size, const real* center, const real* axis, real
     return {first, first - first * length, true};
   }
   real sign = 1;
-  if (fabs(on_edge) >= 1) {  // from a corner along an edge or a face
+  if (side) {  // from a corner along an edge or a face
     if (differs == 0 || differs == 7) return found;
     if (count(differs) == 2) sign = -1, differs = 7 - differs;
     const int k = differs >> 1;
