@@ -156,7 +156,7 @@ def _bound(kind: str, size: np.ndarray) -> float:
 
 
 def error(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Returns the largest difference of contacts [K, 13] in any order, infinite if more or fewer."""
+    """Returns the largest difference of contacts [K, 13] in any order, or infinity."""
     if len(ours) != len(theirs):
         return np.inf
     rest, worst = list(ours), 0.0

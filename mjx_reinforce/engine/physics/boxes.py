@@ -37,7 +37,7 @@ def _first_least(values: jax.Array) -> jax.Array:
 
 @collider(ncon=1)
 def sphere_box(sphere: GeomInfo, box: GeomInfo) -> Collision:
-    """Collides a sphere with a box at its nearest point, or nearest face if its center is inside."""
+    """Collides a sphere with a box at its nearest point, from inside at its nearest face."""
     center = (sphere.pos - box.pos) @ box.mat
     return _ball_on_box(center, sphere.size[0], box)
 

@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from experiments.checks import contacts
 from mjx_reinforce.engine.scalar import UnsupportedPrimitive
 from mjx_reinforce.engine.team import tables
 from mjx_reinforce.envs import models
@@ -33,6 +34,14 @@ _OF_BODIES = {"xpos": 3, "xipos": 3, "cinert": 10, "cvel": 6, "cfrc_ext": 6}
 _OWN = str(Path(__file__).parents[3] / "experiments" / "examples" / "quadruped")
 _MODELS = tomllib.loads((Path(__file__).parent / "models.toml").read_text("utf-8"))
 _MANY = '<geom size=".1"/>'
+_TWO = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <geom type="capsule" size="{first}"/>
+    <body><freejoint/><geom type="box" size="{second}"/></body>
+  </worldbody>
+</mujoco>"""
 _REFUSED = {
     **_MODELS["refused"],
     "4096 geoms or more": {"rest": f"<worldbody>{_MANY * 4096}</worldbody>"},
@@ -148,6 +157,29 @@ def test_lanes_in_any_order_play_alike(task, lanes, tmp_path):
 def test_features(feature, tmp_path):
     m = _model(**_MODELS["features"][feature])
     assert _largest_error(m, tmp_path, skip=3, starts=3) < 1e-9
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("sizes", ["longer", "flatter"])
+def test_a_capsule_meets_a_box_in_every_pose(sizes, tmp_path):
+    """Of the families of ``experiments.checks.contacts``."""
+    geoms, rng = contacts.TwoGeoms("capsule", "box"), np.random.default_rng(0)
+    families = [x for x in contacts.FAMILIES if x[0] == sizes for _ in range(8)]
+    size = contacts.draw(geoms, families[0], rng).size
+    first, second = (" ".join(map(str, x)) for x in size)
+    m = _exact(_C.MjModel.from_xml_string(_TWO.format(first=first, second=second)))
+    play, errors = _compiled(m, tmp_path, tables.NEAR, 1), []
+    for family in families:
+        pose, data = contacts.draw(geoms, family, rng, size), _C.MjData(m)
+        back, exact = pose.mat[0].T, geoms.by_c(pose)
+        data.qpos[:3] = back @ (pose.pos[1] - pose.pos[0])
+        _C.mju_mat2Quat(data.qpos[3:], (back @ pose.mat[1]).ravel())
+        moved = [geoms.by_c(x) for _ in range(3) for x in contacts.moved(pose, rng)]
+        if all(contacts.error(x, exact) < contacts.EQUAL for x in moved):
+            errors.append(_error(m, play, data, 1))
+    assert len(errors) > 150
+    assert max(errors) < 1e-9
 
 
 @pytest.mark.parametrize("reason", _REFUSED)
