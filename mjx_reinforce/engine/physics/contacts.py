@@ -23,6 +23,8 @@ change an episode. Those here agree with MuJoCo 4.0 to rounding, with exceptions
   axis enters the cylinder is pushed out by the shortest way of its deepest point, and in C of the
   whole capsule. Of a capsule that lies on a cap with one end beyond the margin, C doubles the
   contact at the other end if the rim cuts it.
+- Of a cylinder that is within the margin of a plane by more than most of its thickness C has four
+  contacts, and here are three, as in Pusher, whose cylinder never is.
 - Where a capsule is parallel to a face of a box but for rounding, the sign of the rounding decides
   whether C finds one contact or two.
 
@@ -81,19 +83,22 @@ def plane_box(plane: GeomInfo, box: GeomInfo) -> Collision:
     return _collide_points(plane, box.pos + jnp.where(up[:, None], -corners, corners))
 
 
-@collider(ncon=4)
+@collider(ncon=3)
 def plane_cylinder(plane: GeomInfo, cylinder: GeomInfo) -> Collision:
-    """Collides a plane with three points of a cylinder's lower rim, and the lowest of the other.
+    """Collides a plane with a cylinder's lowest point and with two more.
 
-    The three are the lowest, and those that are a third around.
+    They are two of the lower rim, a third around, or the lowest of the other rim if it is lower: C
+    has that one in addition, which matters only where all four are within the margin.
     """
     normal, axis = plane.mat[:, 2], cylinder.mat[:, 2]
     axis = jnp.where(jnp.dot(normal, axis) > 0, -axis, axis)
     down, length = _direction(axis * jnp.dot(axis, normal) - normal)
     down = cylinder.size[0] * jnp.where(length == 0, cylinder.mat[:, 0], down)
     across, half = jnp.cross(down, axis) * np.sqrt(0.75), cylinder.size[1] * axis
-    rims = jnp.stack([half + down, half + across - down / 2, half - across - down / 2, down - half])
-    return _collide_points(plane, cylinder.pos + rims)
+    rim = half + jnp.stack([down, across - down / 2, -across - down / 2])
+    other = down - half
+    lower = jnp.dot(other, normal) < jnp.dot(rim[1], normal)
+    return _collide_points(plane, cylinder.pos + rim.at[1].set(jnp.where(lower, other, rim[1])))
 
 
 @collider(ncon=1)

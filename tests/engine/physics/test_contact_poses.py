@@ -25,7 +25,7 @@ PAIRS = {
     ("sphere", "box"): 0.02,
     ("capsule", "box"): 0.02,
     ("box", "box"): 0.0,
-    ("plane", "cylinder"): 0.02,
+    ("plane", "cylinder"): 0.0,
     ("capsule", "capsule"): 0.02,
 }
 
@@ -67,15 +67,20 @@ def test_contacts_are_those_of_c(pair):
         found = geoms.by_us([*poses, *(x.pose for x in sample)])[: len(poses)]
     for number, (pose, ours) in enumerate(zip(poses, found, strict=True)):
         assert checks.error(ours, geoms.by_c(pose)) < checks.EQUAL, number
-    sample = [x for x in sample if x.decided and not has_parallel_axes(pair, x.pose)]
+    sample = [x for x in sample if x.decided and not is_known(pair, x.pose)]
     assert [(x.family, x.error) for x in sample if not x.error < checks.EQUAL] == []
     assert sum(x.touches for x in sample) > 60
 
 
-def has_parallel_axes(pair, pose):
-    """Such capsules meet in two contacts in C, see contacts.py."""
-    axes = pose.mat[:, :, 2]
-    return pair == ("capsule", "capsule") and np.linalg.norm(np.cross(*axes)) < 1.1e-4
+def is_known(pair, pose):
+    """Parallel capsules and cylinders sunk in a plane, see contacts.py."""
+    if pair == ("capsule", "capsule"):
+        return np.linalg.norm(np.cross(*pose.mat[:, :, 2])) < 1.1e-4
+    radius, half = pose.size[1, :2]
+    needed = 6 * radius * half / np.hypot(3 * radius, 4 * half)
+    axis, place = pose.mat[0].T @ pose.mat[1, :, 2], pose.mat[0].T @ (pose.pos[1] - pose.pos[0])
+    lowest = place[2] - half * abs(axis[2]) - radius * np.hypot(*axis[:2])
+    return pair == ("plane", "cylinder") and lowest < -0.99 * needed
 
 
 def test_what_is_not_cs_is_refused():
