@@ -37,6 +37,8 @@ from mjx_reinforce.engine.scalar import skippable
 
 #: An interval is narrow if its lower end is at least this share of its upper end.
 _NARROW = 0.999
+#: From the unconstrained acceleration the optimum may be more steps away than from a warm start.
+_FROM_COLD = 50
 # mjMINVAL: what C takes for zero.
 _MIN_TRACE = 1e-15
 
@@ -217,7 +219,7 @@ def solve_newton(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array
         settled = same | (decrement < smallest)
         return Search(after, search.steps + 1, settled)
 
-    return problem.solution(descend(model, improve, start(model, data, problem)))
+    return problem.solution(descend(model.opt.iterations, improve, start(model, data, problem)))
 
 
 def posed(model: mjx.Model, data: mjx.Data) -> Problem:
@@ -256,10 +258,10 @@ def _kinds(data: mjx.Data) -> tuple[jax.Array, jax.Array | None]:
     return jnp.arange(fields.efc_D.size) < first, loss
 
 
-def descend(model: mjx.Model, improve: Callable[[Search], Search], start: Any) -> Any:
-    """Returns the point that Newton's method reaches from a start."""
+def descend(most: int, improve: Callable[[Search], Search], start: Any) -> Any:
+    """Returns the point that Newton's method reaches from a start in so many steps."""
     return jax.lax.while_loop(
-        lambda search: ~search.settled & (search.steps < model.opt.iterations),
+        lambda search: ~search.settled & (search.steps < most),
         improve,
         Search(start, jnp.int32(0), jnp.array(False)),
     ).point
@@ -401,7 +403,7 @@ def solve_in_loops(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Arr
         return Search(after, search.steps + 1, same | (decrement < smallest))
 
     start = data.qacc_smooth, jnp.zeros_like(data.qacc_smooth)
-    qacc, _ = descend(model, improve, start)
+    qacc, _ = descend(max(model.opt.iterations, _FROM_COLD), improve, start)
 
     def push(joint_force: jax.Array, rows: Rows) -> tuple[jax.Array, jax.Array]:
         residual = rows.jacobian @ qacc - rows.reference
