@@ -2,10 +2,9 @@
 
 Compiling is the cost: mechanisms with the same options are bodies of one model that do not touch
 one another, and their starts are a batch. C simulates each alone, and its solver goes on to the
-optimum, except where the axis is that of few iterations: there it simulates the same bodies
-together, as the file has them. The error of a cell (a mechanism from one start) is the largest of what MuJoCo computes, in
-double precision: relative where a number is greater than one. What is not simulated is refused, in
-words.
+optimum; on the axis of few iterations C simulates all together, with the options of the file. The
+error of a cell (a mechanism from one start) is the largest of what MuJoCo computes, in double
+precision: relative where a number is greater than one. What is not simulated is refused, in words.
 """
 
 import csv

@@ -27,6 +27,8 @@ also where no constraint is active. Two cases are cheaper and lead to the same a
   Gymnasium's tasks with contacts the solver is ``newton``, whose line search is exact; MJX's own
   remains for elliptic cones and conjugate gradients.
 
+A file that allows its solver few iterations has neither: ``early_stop`` ends where C ends.
+
 The model's solver options stay as they are. The closed form is exact and reads none of
 ``iterations``, ``tolerance`` and the warm start. C's Newton solver also stops at a small gradient
 or a small improvement, ``newton`` only at the optimum or at a step too small to count: now and then
