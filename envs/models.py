@@ -14,6 +14,7 @@ from mujoco import MjModel, MjSpec, mjx  # pyright: ignore[reportAttributeAccess
 
 from mjx_reinforce.engine.checks import explain
 from mjx_reinforce.engine.physics import contacts
+from mjx_reinforce.engine.physics.early_stop import stops_early
 from mjx_reinforce.engine.physics.mjx_internals import geom_pairs
 
 #: MuJoCo's own names; it is a C extension without stubs.
@@ -40,6 +41,7 @@ _ON_JOINT = "give it to the joint, times the square of gear"
 _ONE_NUMBER = "give one number"
 _ONE_SIGN = "give two positive numbers, or two that are not"
 _RISING = "give a second number that is not below it, and a width above zero"
+_GO_ON = 'set <option iterations="100" ls_iterations="50"/>, or solver="Newton" cone="pyramidal"'
 #: Fields of a model that say how soft its constraints are.
 _SOFT = ("dof_{}", "eq_{}", "geom_{}", "jnt_{}", "pair_{}", "tendon_{}_lim", "tendon_{}_fri")
 #: What else MJX ignores in silence.
@@ -234,6 +236,12 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
         yield "sleeping bodies", 'remove <flag sleep="enable"/>'
     if model.opt.noslip_iterations:
         yield "noslip_iterations", "remove it"
+    if stops_early(model):
+        few = f"where C stops after so few iterations ({model.opt.iterations}), with "
+        if model.opt.solver == _C.mjtSolver.mjSOL_CG:
+            yield few + "conjugate gradients", _GO_ON
+        if model.opt.cone == _C.mjtCone.mjCONE_ELLIPTIC and any(geom_pairs(model)):
+            yield few + "elliptic cones", _GO_ON
     if model.opt.disableactuator:
         yield "disabled groups of actuators", "remove actuatorgroupdisable, or those actuators"
     for flag, values in (("spring", "stiffness"), ("damper", "damping")):

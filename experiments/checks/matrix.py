@@ -2,9 +2,9 @@
 
 Compiling is the cost: mechanisms with the same options are bodies of one model that do not touch
 one another, and their starts are a batch. C simulates each alone, and its solver goes on to the
-optimum. The error of a cell (a mechanism from one start) is the largest of what MuJoCo computes, in
-double precision: relative where a number is greater than one. What is not simulated is refused, in
-words.
+optimum; on the axis of few iterations C simulates all together, with the options of the file. The
+error of a cell (a mechanism from one start) is the largest of what MuJoCo computes, in double
+precision: relative where a number is greater than one. What is not simulated is refused, in words.
 """
 
 import csv
@@ -114,10 +114,15 @@ def by_c(each: Mechanism, start: Start) -> list[np.ndarray]:
     model = mujoco.MjModel.from_xml_string(each.xml)
     model.opt.tolerance, model.opt.ls_tolerance, model.opt.iterations = 0, 0, 200
     model.opt.ccd_tolerance, model.opt.ccd_iterations = 1e-12, 200
+    return by_c_as_is(model, start, each.steps)
+
+
+def by_c_as_is(model: Any, start: Start, steps: int) -> list[np.ndarray]:
+    """Returns each field by C MuJoCo after every step, [T, ...], with the model's own options."""
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.act[:], ctrl = start
     shown = []
-    for _ in range(each.steps):
+    for _ in range(steps):
         data.ctrl[:] = control(ctrl, data.time)
         mujoco.mj_step(model, data)
         shown.append([x.flatten() for x in fields(data)])
@@ -223,11 +228,15 @@ def compare(together: Sequence[Mechanism], native: bool = False) -> Iterator[Cel
     else:
         stacked: Any = tuple(map(np.stack, zip(*starts, strict=True)))
         shown = by_us(model, stacked, motor.steps)
+    as_is = together[0].axis == "iterations"
+    stopped = [by_c_as_is(model, start, motor.steps) for start in starts if as_is]
     for each in parts:
         sizes = []
-        for ours, (name, start) in zip(zip(*shown, strict=True), each.starts.items(), strict=False):
-            theirs = by_c(each, start)
+        for k, (name, start) in enumerate(list(each.starts.items())[: len(shown[0])]):
+            ours, theirs = [x[k] for x in shown], by_c(each, start)
             sizes = [field.shape[1] for field in theirs]
+            if as_is:
+                theirs = [x[:, :n] for x, n in zip(stopped[k], sizes, strict=True)]
             errors = [
                 np.max(np.abs(x[:, :n] - y) / np.maximum(1, np.abs(y)), initial=0.0)
                 for x, y, n in zip(ours, theirs, sizes, strict=True)
@@ -237,6 +246,7 @@ def compare(together: Sequence[Mechanism], native: bool = False) -> Iterator[Cel
                 error = float(np.nan_to_num(errors[worst], nan=np.inf))
                 yield Cell(*each.title, name, error, FIELDS[worst])
         shown = [x[..., n:] for x, n in zip(shown, sizes, strict=True)]
+        stopped = [[x[:, n:] for x, n in zip(c, sizes, strict=True)] for c in stopped]
 
 
 def summarized(cells: Sequence[Cell]) -> Iterator[tuple[Any, ...]]:

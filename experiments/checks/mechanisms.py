@@ -151,3 +151,9 @@ def mechanisms() -> Iterator[Mechanism]:
         friction = f'condim="{condim}" friction="1 .02 .01" priority="1"'
         xml = _mjcf("scene", geom=f"{_TABLES['touching'][geom]} {friction}", option=option)
         yield Mechanism("cones", option, f"{geom}, condim {condim}", xml, _moving)
+    for limits in _LISTS["iterations"]:
+        searched = {name: MODELS[name] for name in _LISTS["searched"]}
+        searched |= {name: _mjcf("walker", **parts) for name, parts in _TABLES["walkers"].items()}
+        for name, plain in searched.items():
+            xml = plain.replace("<option ", f"<option {limits} ")
+            yield Mechanism("iterations", limits, name, xml, _pushed, 20)

@@ -56,15 +56,25 @@ def fwd_acceleration(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return data.replace(qacc_smooth=inverse_times(model, data, data.qfrc_smooth))
 
 
-def euler(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Advances by one timestep with damping at the step's end, as ``mjx.euler``."""
+def euler(model: mjx.Model, data: mjx.Data, balanced: bool = True) -> mjx.Data:
+    """Advances by one timestep with damping at the step's end, as ``mjx.euler``.
+
+    Args:
+      model: an MJX model made with impl='jax'.
+      data: its data after the forward pass.
+      balanced: whether the acceleration is that of the forces. Where it is not, C takes the forces
+        if a degree of freedom is damped, and the acceleration otherwise.
+    """
     if model.opt.disableflags & mjx.DisableBit.EULERDAMP:
         return mjx.euler(model, data)
 
     damped = mjx.full_m(model, data) + jnp.diag(model.opt.timestep * model.dof_damping)
     force = data.qfrc_smooth + data.qfrc_constraint
 
-    return advance(model, data, data.act_dot, solve(damped, force))
+    qacc = solve(damped, force)
+    if not balanced:
+        qacc = jnp.where(jnp.any(model.dof_damping > 0), qacc, data.qacc)
+    return advance(model, data, data.act_dot, qacc)
 
 
 def implicitfast(model: mjx.Model, data: mjx.Data) -> mjx.Data:

@@ -37,6 +37,8 @@ from mjx_reinforce.engine.scalar import skippable
 
 #: An interval is narrow if its lower end is at least this share of its upper end.
 _NARROW = 0.999
+#: From the unconstrained acceleration the optimum may be more steps away than from a warm start.
+_FROM_COLD = 50
 # mjMINVAL: what C takes for zero.
 _MIN_TRACE = 1e-15
 
@@ -76,15 +78,25 @@ class Rows(NamedTuple):
         force = jnp.where(slides, -jnp.sign(residual[first]) * self.loss, 0)
         return jnp.pad(force, (0, residual.size - self.loss.size))
 
+    def cost(self, residual: jax.Array) -> jax.Array:
+        """Returns twice what each row adds to the cost, [rows]."""
+        cost = jnp.where(self.active(residual), self.constraint_mass * residual**2, 0)
+        if self.loss is None:
+            return cost
+        first = slice(self.loss.size)
+        beyond = 2 * jnp.abs(residual[first]) - self.loss / self.constraint_mass[first]
+        slides = self.sliding(residual)[first] != 0
+        return cost.at[first].add(jnp.where(slides, self.loss * beyond, 0))
+
     def alike(self, one: jax.Array, other: jax.Array) -> jax.Array:
-        """Returns whether the cost is the same quadratic function [] at two residuals [rows]."""
+        """Returns of each row whether its cost is the same quadratic function at two residuals."""
         same = self.active(one) == self.active(other)
         if self.loss is not None:
             same &= self.sliding(one) == self.sliding(other)
-        return jnp.all(same)
+        return same
 
 
-class _Point(NamedTuple):
+class Point(NamedTuple):
     """An acceleration and what the next step needs of it.
 
     qacc: [nv]
@@ -95,6 +107,33 @@ class _Point(NamedTuple):
     qacc: jax.Array
     imbalance: jax.Array
     residual: jax.Array
+
+
+class Problem(NamedTuple):
+    """What is minimized.
+
+    division: of the rows
+    rows: the constraints
+    inertia: [nv, nv]
+    touching: [C] whether a contact's rows may be other than zero
+    """
+
+    division: contact_rows.Blocks
+    rows: Rows
+    inertia: jax.Array
+    touching: jax.Array
+
+    def along(self, direction: jax.Array) -> jax.Array:
+        """Returns J direction, [rows]."""
+        return contact_rows.along(self.division, self.rows.jacobian, direction, self.touching)
+
+    def solution(self, end: Point) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Returns the acceleration [nv] and the forces of joints [nv] and rows [rows]."""
+        force = self.rows.force(end.residual)
+        joint_force = contact_rows.weighted(
+            self.division, self.inertia, self.rows.jacobian, force, force
+        )[1]
+        return end.qacc, joint_force, force
 
 
 class Search(NamedTuple):
@@ -158,6 +197,33 @@ def solve_newton(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array
     Returns:
       The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
     """
+    problem = posed(model, data)
+    rows, inertia = problem.rows, problem.inertia
+    smallest = smallest_decrement(model, inertia)
+
+    def improve(search: Search) -> Search:
+        before = search.point
+        direction, gradient = newton_direction(problem, before)
+        decrement = -jnp.dot(gradient, direction) / 2
+        change, change_of_imbalance = problem.along(direction), inertia @ direction
+        without_rows = Line(
+            jnp.dot(direction, before.imbalance), jnp.dot(direction, change_of_imbalance)
+        )
+        length = _line_search(rows, before, change, without_rows, model.opt.ls_iterations)
+        after = Point(
+            before.qacc + length * direction,
+            before.imbalance + length * change_of_imbalance,
+            before.residual + length * change,
+        )
+        same = jnp.all(rows.alike(after.residual, before.residual))
+        settled = same | (decrement < smallest)
+        return Search(after, search.steps + 1, settled)
+
+    return problem.solution(descend(model.opt.iterations, improve, start(model, data, problem)))
+
+
+def posed(model: mjx.Model, data: mjx.Data) -> Problem:
+    """Returns the problem of data with its constraint rows made."""
     fields = jax_fields(data)
     num_others = fields.ne + fields.nf + fields.nl
     coupled = contact_rows.couplings(model)
@@ -166,43 +232,22 @@ def solve_newton(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array
     touching = ~(fields.contact.dist - fields.contact.includemargin >= 0)
     jacobian = contact_rows.with_bases(division, fields.efc_J, touching)
     rows = Rows(jacobian, fields.efc_aref, fields.efc_D, *_kinds(data))
-    inertia = mjx.full_m(model, data)
+    return Problem(division, rows, mjx.full_m(model, data), touching)
 
-    def along(direction: jax.Array) -> jax.Array:
-        return contact_rows.along(division, rows.jacobian, direction, touching)
 
-    smallest = smallest_decrement(model, inertia)
+def start(model: mjx.Model, data: mjx.Data, problem: Problem) -> Point:
+    """Returns the unconstrained acceleration, or the warm start if that is on and costs less."""
 
-    def improve(search: Search) -> Search:
-        before = search.point
-        direction, decrement = _newton_direction(division, inertia, rows, before)
-        change, change_of_imbalance = along(direction), inertia @ direction
-        without_rows = Line(
-            jnp.dot(direction, before.imbalance), jnp.dot(direction, change_of_imbalance)
-        )
-        length = _line_search(rows, before, change, without_rows, model.opt.ls_iterations)
-        after = _Point(
-            before.qacc + length * direction,
-            before.imbalance + length * change_of_imbalance,
-            before.residual + length * change,
-        )
-        same = rows.alike(after.residual, before.residual)
-        settled = same | (decrement < smallest)
-        return Search(after, search.steps + 1, settled)
+    def at(qacc: jax.Array) -> Point:
+        imbalance = problem.inertia @ qacc - data.qfrc_smooth
+        return Point(qacc, imbalance, problem.along(qacc) - problem.rows.reference)
 
-    def begin(qacc: jax.Array) -> _Point:
-        imbalance = inertia @ qacc - data.qfrc_smooth
-        return _Point(qacc, imbalance, along(qacc) - rows.reference)
-
-    start = begin(data.qacc_smooth)
-    if not model.opt.disableflags & mjx.DisableBit.WARMSTART:
-        warm = begin(data.qacc_warmstart)
-        better = _cost(rows, data, warm) < _cost(rows, data, start)
-        start = jax.tree.map(lambda w, s: jnp.where(better, w, s), warm, start)
-    end = descend(model, improve, start)
-    force = rows.force(end.residual)
-    joint_force = contact_rows.weighted(division, inertia, rows.jacobian, force, force)[1]
-    return end.qacc, joint_force, force
+    cold = at(data.qacc_smooth)
+    if model.opt.disableflags & mjx.DisableBit.WARMSTART:
+        return cold
+    warm = at(data.qacc_warmstart)
+    better = _cost(problem.rows, data, warm) < _cost(problem.rows, data, cold)
+    return jax.tree.map(lambda w, c: jnp.where(better, w, c), warm, cold)
 
 
 def _kinds(data: mjx.Data) -> tuple[jax.Array, jax.Array | None]:
@@ -213,10 +258,10 @@ def _kinds(data: mjx.Data) -> tuple[jax.Array, jax.Array | None]:
     return jnp.arange(fields.efc_D.size) < first, loss
 
 
-def descend(model: mjx.Model, improve: Callable[[Search], Search], start: Any) -> Any:
-    """Returns the point that Newton's method reaches from a start."""
+def descend(most: int, improve: Callable[[Search], Search], start: Any) -> Any:
+    """Returns the point that Newton's method reaches from a start in so many steps."""
     return jax.lax.while_loop(
-        lambda search: ~search.settled & (search.steps < model.opt.iterations),
+        lambda search: ~search.settled & (search.steps < most),
         improve,
         Search(start, jnp.int32(0), jnp.array(False)),
     ).point
@@ -227,37 +272,31 @@ def smallest_decrement(model: mjx.Model, inertia: jax.Array) -> jax.Array:
     return model.opt.tolerance * jnp.maximum(jnp.trace(inertia), _MIN_TRACE)
 
 
-def _cost(rows: Rows, data: mjx.Data, point: _Point) -> jax.Array:
+def _cost(rows: Rows, data: mjx.Data, point: Point) -> jax.Array:
     """Returns what is minimized, []."""
-    active = rows.active(point.residual)
-    penalty = jnp.sum(jnp.where(active, rows.constraint_mass * point.residual**2, 0))
-    if rows.loss is not None:
-        slides, first = rows.sliding(point.residual)[: rows.loss.size], slice(rows.loss.size)
-        beyond = 2 * jnp.abs(point.residual[first]) - rows.loss / rows.constraint_mass[first]
-        penalty += jnp.sum(jnp.where(slides != 0, rows.loss * beyond, 0))
+    penalty = jnp.sum(rows.cost(point.residual))
     return (jnp.dot(point.imbalance, point.qacc - data.qacc_smooth) + penalty) / 2
 
 
-def _newton_direction(
-    division: contact_rows.Blocks, inertia: jax.Array, rows: Rows, point: _Point
-) -> tuple[jax.Array, jax.Array]:
-    """Returns Newton's step [nv].
+def newton_direction(problem: Problem, point: Point) -> tuple[jax.Array, jax.Array]:
+    """Returns Newton's step [nv] and the gradient [nv].
 
-    Also returns by how much the cost would fall [] along the whole step if no row changed. That is
-    half the product of gradient and step, up to the sign; it keeps its digits near the minimum,
-    where the difference of two costs would be rounding error.
+    Half their product is by how much the cost would fall along the whole step if no row changed, up
+    to the sign; it keeps its digits near the minimum, where the difference of two costs would be
+    rounding error.
     """
+    rows = problem.rows
     active_mass = jnp.where(rows.active(point.residual), rows.constraint_mass, 0)
+    force = rows.force(point.residual)
     hessian, joint_force = contact_rows.weighted(
-        division, inertia, rows.jacobian, active_mass, rows.force(point.residual)
+        problem.division, problem.inertia, rows.jacobian, active_mass, force
     )
     gradient = point.imbalance - joint_force
-    direction = -solve(hessian, gradient)
-    return direction, -jnp.dot(gradient, direction) / 2
+    return -solve(hessian, gradient), gradient
 
 
 def _line_search(
-    rows: Rows, point: _Point, change: jax.Array, without_rows: Line, max_rounds: int
+    rows: Rows, point: Point, change: jax.Array, without_rows: Line, max_rounds: int
 ) -> jax.Array:
     """Returns the length of the step that leads to the least cost, [].
 
@@ -357,14 +396,14 @@ def solve_in_loops(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Arr
 
         def compare(same: jax.Array, one: tuple) -> tuple[jax.Array, None]:
             rows, residual, change = one
-            return same & rows.alike(residual + length * change, residual), None
+            return same & jnp.all(rows.alike(residual + length * change, residual)), None
 
         same, _ = _fold(compare, jnp.array(True), groups, residuals, changes)
         after = qacc + length * direction, imbalance + length * change_of_imbalance
         return Search(after, search.steps + 1, same | (decrement < smallest))
 
     start = data.qacc_smooth, jnp.zeros_like(data.qacc_smooth)
-    qacc, _ = descend(model, improve, start)
+    qacc, _ = descend(max(model.opt.iterations, _FROM_COLD), improve, start)
 
     def push(joint_force: jax.Array, rows: Rows) -> tuple[jax.Array, jax.Array]:
         residual = rows.jacobian @ qacc - rows.reference
@@ -413,7 +452,7 @@ def _direction_in_loops(
 ) -> tuple[jax.Array, jax.Array, list[jax.Array]]:
     """Returns the step [nv], by how much the cost would fall [], and residuals.
 
-    See ``_newton_direction``.
+    See ``newton_direction``.
     """
 
     def add(sums: tuple, rows: Rows) -> tuple[tuple, jax.Array]:

@@ -27,6 +27,8 @@ also where no constraint is active. Two cases are cheaper and lead to the same a
   Gymnasium's tasks with contacts the solver is ``newton``, whose line search is exact; MJX's own
   remains for elliptic cones and conjugate gradients.
 
+A file that allows its solver few iterations has neither: ``early_stop`` ends where C ends.
+
 The model's solver options stay as they are. The closed form is exact and reads none of
 ``iterations``, ``tolerance`` and the warm start. C's Newton solver also stops at a small gradient
 or a small improvement, ``newton`` only at the optimum or at a step too small to count: now and then
@@ -40,7 +42,7 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
-from mjx_reinforce.engine.physics import contacts, inertia, limits, newton, touching
+from mjx_reinforce.engine.physics import contacts, early_stop, inertia, limits, newton, touching
 from mjx_reinforce.engine.physics.mjx_internals import advance, jax_fields, with_fields
 
 # For each stage: its place in the timestep, its weight, and the place of the next stage.
@@ -77,7 +79,7 @@ def step(
         return runge_kutta_4(model, data, evaluate)
     data = evaluate(data)
     if integrator == mjx.IntegratorType.EULER:
-        return inertia.euler(model, data)
+        return inertia.euler(model, data, balanced=not early_stop.stops_early(model))
     if integrator == mjx.IntegratorType.IMPLICITFAST:
         return inertia.implicitfast(model, data)
     raise NotImplementedError(f"MJX has no integrator {integrator}")
@@ -107,7 +109,7 @@ def solve_constraints(model: mjx.Model, data: mjx.Data) -> mjx.Data:
       The data with ``qacc``, ``qfrc_constraint`` and ``efc_force``.
     """
     fields = jax_fields(data)
-    if limits.supports(model, data):
+    if limits.supports(model, data) and not early_stop.stops_early(model):
         active, solver = limits.past_limit(model, data), limits.solve_limits
     elif fields.ne or fields.nf:  # rows that are always active
         active, solver = jnp.array(True), _solve_in_steps
@@ -136,15 +138,17 @@ def _some_active(data: mjx.Data) -> jax.Array:
 
 
 def _solve_in_steps(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Solves by Newton's method where it applies, otherwise by MJX's solver.
+    """Solves by C's search or by Newton's method where they apply, otherwise by MJX's solver.
 
     Returns:
       The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
     """
     if not jax_fields(data).contact.dim.size:  # MJX's solver fails on elliptic cones of none
         model = model.replace(opt=model.opt.replace(cone=mjx.ConeType.PYRAMIDAL))
+    if newton.supports(model) and early_stop.stops_early(model):
+        return touching.solve_touching(early_stop.solve, early_stop.solve, model, data)
     if newton.supports(model):
-        return touching.solve_touching(newton.solve_newton, model, data)
+        return touching.solve_touching(newton.solve_newton, newton.solve_in_loops, model, data)
     data = mjx.solve(model, data)
     return data.qacc, data.qfrc_constraint, jax_fields(data).efc_force
 
@@ -168,8 +172,9 @@ def runge_kutta_4(
         stage = like(evaluate(stage), stage)
         # The next stage's solver starts at this one's solution. C starts all four where the time
         # step did: the minimum is the same, after more steps (Humanoid, random actions: 1.9, not
-        # 1.7).
-        stage = stage.replace(qacc_warmstart=stage.qacc)
+        # 1.7). What stops before the minimum has to start there.
+        if not early_stop.stops_early(model):
+            stage = stage.replace(qacc_warmstart=stage.qacc)
         rate = _displacement_rate(model, stage.qvel, rate, position)
         rates = rate, stage.qacc, stage.act_dot
         sums = tuple(total + weight * x for total, x in zip(sums, rates, strict=True))

@@ -18,7 +18,6 @@ from jax import lax
 from mujoco import mjx
 
 from mjx_reinforce.engine.physics.mjx_internals import jax_fields, with_contact
-from mjx_reinforce.engine.physics.newton import solve_in_loops
 from mjx_reinforce.engine.physics.rows import make_constraint
 from mjx_reinforce.engine.scalar import is_written_out, writing_out
 
@@ -32,15 +31,15 @@ _UNROLLABLE = 6
 _AT_ONCE = 8
 
 
-def solve_touching(solver: Solver, model: mjx.Model, data: mjx.Data) -> Solution:
+def solve_touching(solver: Solver, rarely: Solver, model: mjx.Model, data: mjx.Data) -> Solution:
     """Solves with the contacts that touch, or with all where more touch than there is room for.
 
-    The latter is so rare that ``newton.solve_in_loops`` does it, in little code. Where those that
-    there is room for have more than half of the rows, it is not worth the branches (Pusher on an
-    H200: 0.8 of the speed, 0.7 with a trained policy), and ``solver`` takes all.
+    Where those that there is room for have more than half of the rows, it is not worth the branches
+    (Pusher on an H200: 0.8 of the speed, 0.7 with a trained policy), and ``solver`` takes all.
 
     Args:
       solver: what solves; it takes fewer contacts than the model has.
+      rarely: what solves where there is no room, which should be little code.
       model: an MJX model.
       data: with its constraint rows made.
     """
@@ -50,7 +49,7 @@ def solve_touching(solver: Solver, model: mjx.Model, data: mjx.Data) -> Solution
     saved = sum(_rows_of_one(contact, kind) * max(0, kind.size - room) for kind in kinds)
     if 2 * saved < rows or not is_written_out():
         return solver(model, data)
-    return _with_few(solver, model, data, kinds, room)
+    return _with_few(solver, rarely, model, data, kinds, room)
 
 
 def _room(model: mjx.Model) -> int:
@@ -63,7 +62,12 @@ def _room(model: mjx.Model) -> int:
 
 
 def _with_few(
-    solver: Solver, model: mjx.Model, data: mjx.Data, kinds: list[np.ndarray], room: int
+    solver: Solver,
+    rarely: Solver,
+    model: mjx.Model,
+    data: mjx.Data,
+    kinds: list[np.ndarray],
+    room: int,
 ) -> Solution:
     """Solves; the kinds are the numbers of the contacts of each dimension."""
     contact = jax_fields(data).contact
@@ -88,7 +92,7 @@ def _with_few(
 
     def every() -> Solution:
         with writing_out():
-            return solve_in_loops(model, make_constraint(model, data))
+            return rarely(model, make_constraint(model, data))
 
     def packed_kind(kind: np.ndarray) -> tuple[Any, jax.Array]:
         return _pack(jax.tree.map(lambda x: x[kind], contact), touching[kind], room)

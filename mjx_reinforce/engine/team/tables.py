@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from mjx_reinforce.engine.base import MjModel
+from mjx_reinforce.engine.physics.early_stop import stops_early
 from mjx_reinforce.engine.physics.mjx_internals import geom_pairs
 from mjx_reinforce.engine.scalar import UnsupportedPrimitive
 
@@ -104,6 +105,8 @@ def _lacking_options(m: Any) -> Iterable[tuple[str, Any]]:
     known = (kinds.mjINT_EULER, kinds.mjINT_RK4, kinds.mjINT_IMPLICITFAST)
     yield "an integrator other than Euler, RK4 and implicitfast", opt.integrator not in known
     yield "a solver other than Newton", opt.solver != _C.mjtSolver.mjSOL_NEWTON
+    few = f"few iterations of its solver ({opt.iterations}, {opt.ls_iterations} along a line)"
+    yield few, stops_early(m)
     yield "elliptic friction cones", opt.cone != _C.mjtCone.mjCONE_PYRAMIDAL
     flags = opt.disableflags | opt.enableflags | opt.disableactuator
     yield "flags that disable or enable parts of the physics", flags
