@@ -254,7 +254,7 @@ def _exclude(model: MjModel, pairs: Sequence[tuple[int, int]]) -> str:
     names = [model.body(int(model.geom_bodyid[geom])).name for geom in pairs[0]]
     if not all(names):
         return ""
-    return ' or, in <contact>, <exclude body1="{}" body2="{}"/>'.format(*names)
+    return ', or with <contact><exclude body1="{}" body2="{}"/></contact>'.format(*names)
 
 
 def geom_name(model: MjModel, geom: int) -> str:

@@ -49,6 +49,7 @@ def write_class(settings: NewSettings) -> None:
         raise ValueError(f"{output} must be in the folder of {xml}, where it looks for the model")
     check_output(output, settings.overwrite, ".py")
     from mjx_reinforce.envs import models
+    from mjx_reinforce.envs.instability import instability
 
     path = str(xml if xml.parent != Path() else Path.cwd() / xml)
     model = models.load_model(path)
@@ -56,6 +57,8 @@ def write_class(settings: NewSettings) -> None:
     write_bytes(output, class_source(model, xml.name, output.stem).encode())
     module = output.stem
     train = f"python -m mjx_reinforce.train --env {module}:{_title(module)} --output {module}_run"
+    if (warning := instability(model)) is not None:
+        print(warning)
     print(f"{output}: write its reward, then, in its folder: {train}")
 
 

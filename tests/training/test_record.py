@@ -171,11 +171,13 @@ def test_a_run_is_hopeless_if_all_that_train_are():
     assert not hopeless([5, 9, 0], [10, 10, 10], block=5)
 
 
-def test_a_block_of_broken_updates_is_one_line():
+def test_broken_updates_are_one_line_with_the_remedy():
     met = np.repeat([0, 2], [994, 6])
     assert measured.describe_nonfinite(met, 7, 9) == (
-        "up to update 9: 6 of 1,000 seeds met numbers that are not finite or beyond 1e10 "
-        "(1001, 1002, 1003, 1004, 1005, ...), in 12 updates"
+        "up to update 9, 6 of 1,000 seeds (numbers 1001, 1002, 1003, 1004, 1005, ...) met values "
+        "that are not finite or beyond 1e10. Such an episode counts as the worst of its update. "
+        "This line comes once; the number of such updates comes at the end. If they are many, give "
+        "the model a smaller timestep or more armature, or lower --learning-rate"
     )
 
 
