@@ -119,9 +119,23 @@ def _compile_model(
         raise ValueError(f"MuJoCo cannot compile {_name(xml_file)}: {explain(error)}") from error
 
 
-def replaced(episode: dict[str, Any]) -> dict[str, Any]:
-    """Returns the fields of the model that an episode replaces, see ``MujocoEnv.randomize``."""
-    return {name: value for name, value in episode.items() if name in RANDOM}
+def replaced(model: Any, episode: dict[str, Any]) -> dict[str, Any]:
+    """Returns the fields of a model that an episode replaces, see ``MujocoEnv.randomize``.
+
+    The masses of subtrees follow from those of bodies.
+
+    Args:
+      model: an ``MjModel`` or an ``mjx.Model``.
+      episode: what ``MujocoEnv.randomize`` returned.
+    """
+    fields = {name: value for name, value in episode.items() if name in RANDOM}
+    if "body_mass" in fields:
+        inside = np.eye(model.nbody)  # [i, j]: whether body j is in the subtree of body i
+        for body in range(model.nbody - 1, 0, -1):  # parents come first
+            inside[model.body_parentid[body]] += inside[body]
+        mass = fields["body_mass"]
+        fields["body_subtreemass"] = inside.astype(mass.dtype) @ mass
+    return fields
 
 
 def make_data(model: "mjx.Model") -> mjx.Data:
