@@ -190,7 +190,7 @@ def _missing(model: MjModel) -> Iterator[tuple[str, str]]:
             # MJX would ignore the discrete integrator, which _ignored says.
             if name != "mjINT_DISCRETE":
                 yield f"MJX has no {name}", remedy
-    if not model.nv:
+    if model.nu and not model.nv:
         yield "nothing in it moves, and MJX needs a joint", "add a <joint>"
     if model.nflex:
         yield "MJX has no flexible bodies", "remove the <flexcomp> or <flex>"

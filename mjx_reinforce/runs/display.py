@@ -229,7 +229,7 @@ def summary_table(summary: dict[str, Any]) -> Table:
         table.add_row("seeds whose return is not finite", row)
     if broken := sum(summary["nonfinite"]):
         row = f"{broken:,}, of all seeds together"
-        table.add_row("updates that met numbers that are not finite", row)
+        table.add_row("updates with values not finite", row)
     if (at_end := summary["seeds_solved_at_end"]) is not None:
         row = f"{at_end:,} of {num_seeds} at the end, {summary['seeds_ever_solved']:,} ever"
         table.add_row(f"seeds at {summary['threshold']:,g}, the task's threshold", row)

@@ -110,7 +110,7 @@ def test_what_is_no_model_is_refused():
     read = mujoco.MjSpec.from_string  # pyright: ignore[reportAttributeAccessIssue]
     for named, what in (("", "the model"), (' model="arm"', "the model 'arm'")):
         for other in (read(f"<mujoco{named}/>"), read(f"<mujoco{named}/>").compile()):
-            with pytest.raises(ValueError, match=rf"{what}, for .*:\s*1. it has no actuators"):
+            with pytest.raises(ValueError, match=f"{what}: it has no actuators; add"):
                 Box(xml_file=other)
 
 
