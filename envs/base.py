@@ -21,7 +21,7 @@ from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
 from mjx_reinforce.engine.scalar import prune, whole
 from mjx_reinforce.envs import models
-from mjx_reinforce.envs.outcomes import check_episode, check_outcome, check_start
+from mjx_reinforce.envs.outcomes import check_centers, check_episode, check_outcome, check_start
 from mjx_reinforce.envs.parts import Named, View
 from mjx_reinforce.envs.settings import EpisodeSettings, build_settings
 
@@ -168,9 +168,12 @@ class MujocoEnv(Env):
           Numbers and arrays by name, such as a goal or a command, which ``outcome`` and ``observe``
           read as ``data.episode["goal"]``. Those with a name of ``models.RANDOM``, such as
           ``geom_friction`` [ngeom, 3] or ``body_mass`` [nbody], take the place of that field of
-          the model in this episode. What MuJoCo computes from a field when it compiles a model,
-          such as ``dof_invweight0``, stays that of the model: with masses twice as large, contacts
-          placed a landing body 7 mm from where the model compiled with these masses has it.
+          the model in this episode. What MuJoCo computes from a field when it compiles a model
+          stays that of the model, but for ``body_subtreemass``: ``body_invweight0``,
+          ``dof_invweight0`` and ``tendon_invweight0``, which say how soft contacts and limits are,
+          ``actuator_acc0``, by which muscles scale, and ``actuator_length0``. With masses twice as
+          large, contacts placed a landing body 7 mm from where the model compiled with these masses
+          has it. ``body_ipos`` of a free body needs ``<body simple="false">``.
         """
         return {}
 
@@ -189,6 +192,8 @@ class MujocoEnv(Env):
         if type(self).randomize is not MujocoEnv.randomize:
             key, rng = jax.random.split(rng)
             episode = check_episode(name, self.randomize(key), self.model)
+            if "body_ipos" in episode:
+                check_centers(name, self.randomize, self.model.body_ipos, self.mj_model)
         sizes = self.mj_model.nq, self.mj_model.nv
         return episode, check_start(name, self.initial(rng), sizes)
 
@@ -209,7 +214,7 @@ class MujocoEnv(Env):
 
     def _physics_of(self, episode: dict[str, jax.Array]) -> tuple[Any, Any]:
         """Returns the forward pass and the step of the model as it is in an episode."""
-        fields = models.replaced(episode)
+        fields = models.replaced(self.mj_model, episode)
         if not fields:
             return self._forward, self._physics_step
         model = self.model.replace(**fields)
@@ -255,7 +260,7 @@ class MujocoEnv(Env):
             start_of_loop = start, jnp.array(True)
             data, sound = jax.lax.fori_loop(0, self.frame_skip, advance, start_of_loop)
             if self.contact_forces:
-                model = self.model.replace(**models.replaced(before.episode))
+                model = self.model.replace(**models.replaced(self.mj_model, before.episode))
                 data = mjx.rne_postconstraint(model, data)
         view = View(data, self.mj_model, before.episode)
         reward, terminated, terms = self._outcome(before, start, view, action)
@@ -271,7 +276,7 @@ class MujocoEnv(Env):
 
     def _stays_whole(self, episode: dict[str, jax.Array]) -> bool:
         """Returns whether the physics is to stay one operation, which device code computes."""
-        return is_kept_whole() and not models.replaced(episode)
+        return is_kept_whole() and not models.replaced(self.mj_model, episode)
 
     def _whole(self, name: str, start: mjx.Data) -> tuple[mjx.Data, jax.Array]:
         """Returns what an operation of the device code makes of a simulation; whether it is sound.

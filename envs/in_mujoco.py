@@ -83,8 +83,11 @@ class InMujoco:
         """Begins an episode and returns its first observation [O]; consumes the key."""
         self._episode, (qpos, qvel) = self._start(rng)
         self.model = model = copy.copy(self.env.mj_model)
-        for name, value in models.replaced(self._episode).items():
+        for name, value in models.replaced(model, self._episode).items():
             getattr(model, name)[:] = value
+        if "body_ipos" in self._episode:  # C would take the places of frames that were the same
+            for part in (model.body_sameframe, model.geom_sameframe, model.site_sameframe):
+                part[:] = int(_C.mjtSameFrame.mjSAMEFRAME_NONE)
         data = _C.MjData(model)
         data.qpos[:], data.qvel[:] = qpos, qvel
         _C.mj_forward(model, data)

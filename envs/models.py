@@ -3,7 +3,7 @@
 import copy
 import importlib.resources
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -12,10 +12,9 @@ import mujoco
 import numpy as np
 from mujoco import MjModel, MjSpec, mjx  # pyright: ignore[reportAttributeAccessIssue]
 
-from mjx_reinforce.engine.checks import explain
+from mjx_reinforce.engine.checks import BadEnvironmentError, explain
 from mjx_reinforce.engine.physics import contacts
-from mjx_reinforce.engine.physics.early_stop import stops_early
-from mjx_reinforce.engine.physics.mjx_internals import geom_pairs
+from mjx_reinforce.envs.refusals import check_meshes, check_supported, is_off, may_touch
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco
@@ -29,60 +28,14 @@ RANDOM = (
     *("body_mass", "body_inertia", "body_ipos", "geom_friction", "dof_damping", "dof_armature"),
     *("jnt_stiffness", "actuator_gainprm", "actuator_biasprm", "actuator_gear"),
 )
-#: What MJX does not carry: its size in the model, what it is, and how to do without.
-NOT_CARRIED = {
-    "history": ("nhistory", "delays", "remove delay and interval from actuators and sensors"),
-    "plugin": ("nplugin", "plugins", "remove them"),
-    "plastic": ("nplastic", "plastic springs", "remove springyield"),
-}
-_HOLDS = (int(_C.mjtEq.mjEQ_CONNECT), int(_C.mjtEq.mjEQ_WELD))
-_WITHIN_MARGIN = "give it a margin of at most half of its range"
-_ON_JOINT = "give it to the joint, times the square of gear"
-_ONE_NUMBER = "give one number"
-_ONE_SIGN = "give two positive numbers, or two that are not"
-_RISING = "give a second number that is not below it, and a width above zero"
-_GO_ON = 'set <option iterations="100" ls_iterations="50"/>, or solver="Newton" cone="pyramidal"'
-#: Fields of a model that say how soft its constraints are.
-_SOFT = ("dof_{}", "eq_{}", "geom_{}", "jnt_{}", "pair_{}", "tendon_{}_lim", "tendon_{}_fri")
-#: What else MJX ignores in silence.
-_IGNORED = (
-    ("actuator_armature", "the armature of an actuator", _ON_JOINT),
-    ("actuator_damping", "the damping of an actuator", _ON_JOINT),
-    ("actuator_dampingpoly", "the polynomial damping of an actuator", _ON_JOINT),
-    ("actuator_actearly", "actearly of an actuator", 'remove actearly="true"'),
-    ("jnt_stiffnesspoly", "the polynomial stiffness of a joint", _ONE_NUMBER),
-    ("dof_dampingpoly", "the polynomial damping of a joint", _ONE_NUMBER),
-    ("tendon_stiffnesspoly", "the polynomial stiffness of a tendon", _ONE_NUMBER),
-    ("tendon_dampingpoly", "the polynomial damping of a tendon", _ONE_NUMBER),
-    ("geom_adhesion", "adhesive geoms", "remove adhesion"),
-    ("pair_adhesion", "adhesive contact pairs", "remove adhesion"),
-    ("geom_surfacevel", "moving surfaces", "remove surfacevel"),
-    ("geom_fluid", "the fluid forces on ellipsoids", "remove fluidshape"),
-)
-#: Part of MJX's message -> what to change in the MJCF.
-_REMEDIES = {
-    "SOL_PGS": 'set <option solver="Newton"/>',
-    "INT_IMPLICIT": 'set <option integrator="implicitfast"/>',
-    "fluid drag": 'set <option integrator="Euler"/> or remove density and viscosity',
-    "collisions": "keep that pair apart with contype and conaffinity, or use spheres, capsules, "
-    "boxes and planes",
-    "margin/gap": "remove margin and gap from those geoms",
-    "condim=1": 'set <option cone="pyramidal"/> or condim="3"',
-    "sensor": "remove that sensor",
-    "mjSENS_": "remove those sensors",
-    "mjTRN_BODY": "replace the adhesion actuators by friction (friction, condim of the geoms), or "
-    "by a <weld> equality",
-    "mjTRN_SLIDERCRANK": "replace the slider-crank by the <motor> of a joint, or make its rod a "
-    "body that a <connect> equality holds",
-    "_USER": "replace the user-defined actuators by <motor>, <position>, <velocity> or <muscle>",
-    "mjEQ_": "replace those equalities by <connect>, <weld>, <joint> or <tendon>",
-    "ENBL_OVERRIDE": 'set <flag override="disable"/> and give geoms solref and solimp of their own',
-    "mjENBL_": "take that <flag> out of <option>",
-    "Flex": "remove the flexible body",
-}
-#: What MJX refuses and no step depends on: the energy, and a check of the inverse dynamics.
+#: What no step depends on, and MJX refuses: the energy, and a check of the inverse dynamics.
 _ONLY_REPORTS = int(_C.mjtEnableBit.mjENBL_ENERGY | _C.mjtEnableBit.mjENBL_FWDINV)
-_ELSE = "remove it; MuJoCo's documentation lists what MJX supports under 'MJX, feature parity'"
+#: Elements of <custom> that MJX reads, by which it drops contacts. To C they are the user's own.
+_READ_BY_MJX = ("max_contact_points", "max_geom_pairs")
+#: Equalities whose forces on bodies MJX adds up.
+_HOLDS = (int(_C.mjtEq.mjEQ_CONNECT), int(_C.mjtEq.mjEQ_WELD))
+#: Sensors of contacts.
+_FEELS = (int(_C.mjtSensor.mjSENS_TOUCH), int(_C.mjtSensor.mjSENS_CONTACT))
 #: What MuJoCo calls a model without a name.
 _NAMELESS = "MuJoCo Model"
 #: The name of a file, an ``MjSpec`` or an ``MjModel``, which MuJoCo does not declare.
@@ -97,7 +50,8 @@ def load_model(xml_file: ModelSource) -> Any:
         ``MjSpec`` or ``MjModel``, of which a copy is taken.
 
     Raises:
-      ValueError: there is no such file, MuJoCo cannot compile it, or nothing in it can be moved.
+      ValueError: there is no such file, MuJoCo cannot compile it, or nothing in it can be moved;
+        then the message has all that ``to_mjx`` refuses, too.
     """
     if isinstance(xml_file, MjModel):
         model = copy.copy(xml_file)
@@ -107,8 +61,13 @@ def load_model(xml_file: ModelSource) -> Any:
             warnings.filterwarnings("ignore", ".*'settotalmass' is deprecated")
             model = _compile_model(MjSpec.compile, spec(xml_file), xml_file)
     if not model.nu:
-        raise ValueError(f"{_name(xml_file)} has no actuators; add an <actuator> element")
+        check_supported(model, _name(xml_file), "it has no actuators; add an <actuator> element")
     model.opt.enableflags &= ~_ONLY_REPORTS
+    if is_off(model, "constraint"):  # C looks for no contacts then, MJX does
+        model.opt.disableflags |= _C.mjtDisableBit.mjDSBL_CONTACT
+    for number in range(model.nnumeric):
+        if model.numeric(number).name in _READ_BY_MJX:
+            model.name_numericadr[number] = len(model.names) - 1  # a name of no letters
     return model
 
 
@@ -161,9 +120,23 @@ def _compile_model(
         raise ValueError(f"MuJoCo cannot compile {_name(xml_file)}: {explain(error)}") from error
 
 
-def replaced(episode: dict[str, Any]) -> dict[str, Any]:
-    """Returns the fields of the model that an episode replaces, see ``MujocoEnv.randomize``."""
-    return {name: value for name, value in episode.items() if name in RANDOM}
+def replaced(model: Any, episode: dict[str, Any]) -> dict[str, Any]:
+    """Returns the fields of a model that an episode replaces, see ``MujocoEnv.randomize``.
+
+    The masses of subtrees follow from those of bodies.
+
+    Args:
+      model: an ``MjModel`` or an ``mjx.Model``.
+      episode: what ``MujocoEnv.randomize`` returned.
+    """
+    fields = {name: value for name, value in episode.items() if name in RANDOM}
+    if "body_mass" in fields:
+        inside = np.eye(model.nbody)  # [i, j]: whether body j is in the subtree of body i
+        for body in range(model.nbody - 1, 0, -1):  # parents come first
+            inside[model.body_parentid[body]] += inside[body]
+        mass = fields["body_mass"]
+        fields["body_subtreemass"] = inside.astype(mass.dtype) @ mass
+    return fields
 
 
 def make_data(model: "mjx.Model") -> mjx.Data:
@@ -172,89 +145,41 @@ def make_data(model: "mjx.Model") -> mjx.Data:
 
 
 def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
-    """Returns MJX's version of a compiled model.
+    """Returns MJX's version of a model.
 
     Args:
-      model: the compiled model.
+      model: of ``load_model``.
       xml_file: where it came from, for the message.
 
     Raises:
-      ValueError: MJX cannot run it; the message names the feature and what to change.
+      UnsupportedError: it cannot be simulated as by C MuJoCo; the message has every reason.
+      BadEnvironmentError: MJX fails where it should not.
     """
-    for feature, remedy in _ignored(model):
-        raise ValueError(f"MJX cannot run {_name(xml_file)}: MJX would ignore {feature}; {remedy}")
-    if _C.mjtSensor.mjSENS_RANGEFINDER in model.sensor_type and not model.nmat:
-        raise ValueError(
-            f"MJX cannot run {_name(xml_file)}: its rangefinders work only in a model that has a "
-            'material, a bug of MJX; add <asset><material name="any"/></asset>'
-        )
+    name = _name(xml_file)
+    check_supported(model, name)
     try:
-        for *geoms, pair in geom_pairs(model):
-            kinds = tuple(mjx.GeomType(kind) for kind in model.geom_type[geoms])
-            names = " on ".join(kind.name.lower() for kind in reversed(kinds))
-            margin = model.geom_margin[geoms].sum() if pair < 0 else model.pair_margin[pair]
-            if kinds in contacts.UNLIKE_C:
-                raise NotImplementedError(f"collisions of {names}, {contacts.UNLIKE_C[kinds]}")
-            if kinds in contacts.UNLIKE_C_WITHIN_MARGIN and margin:
-                raise NotImplementedError(f"{names} with margin/gap, which MJX ignores")
         # Not on JAX's first device, which may be another process's.
         converted = mjx.put_model(model, impl="jax", device=jax.local_devices()[0])
         # Notices what the model alone does not show; its arrays are not made.
         jax.eval_shape(lambda: make_data(model))
-    except NotImplementedError as error:
-        feature = str(error)
-        remedy = next((change for part, change in _REMEDIES.items() if part in feature), _ELSE)
-        raise ValueError(f"MJX cannot run {_name(xml_file)}: {feature}; {remedy}") from error
+    except Exception as error:  # of another library: no refusal
+        raise BadEnvironmentError(f"converting {name} to MJX fails: {explain(error)}") from error
+    check_meshes(converted, model, name)
+    return _without_rows(converted, model)
+
+
+def _without_rows(converted: mjx.Model, model: MjModel) -> mjx.Model:
+    """Returns the model without what MJX reads from constraint rows that are not there.
+
+    A sensor of contacts is 0 in C where nothing can touch, and so is that of a kind which MJX does
+    not compute. Equalities that a flag disables have no forces.
+    """
+    if not may_touch(model):
+        feels = np.isin(model.sensor_type, _FEELS)
+        sensors = np.where(feels, int(_C.mjtSensor.mjSENS_USER), model.sensor_type)
+        converted = converted.replace(sensor_type=sensors)
+    if is_off(model, "equality") or is_off(model, "constraint"):
+        holds = np.isin(model.eq_type, _HOLDS)
+        kinds = np.where(holds, int(_C.mjtEq.mjEQ_JOINT), model.eq_type)
+        converted = converted.replace(eq_type=kinds)
     return converted
-
-
-def _is_off(model: MjModel, flag: str) -> bool:
-    """Returns whether a flag of <option> is disabled."""
-    return bool(model.opt.disableflags & getattr(_C.mjtDisableBit, f"mjDSBL_{flag.upper()}"))
-
-
-def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
-    """Yields what MJX would ignore in silence, and how to do without it."""
-    for field, feature, remedy in (*NOT_CARRIED.values(), *_IGNORED):
-        if np.any(getattr(model, field)):
-            yield feature, remedy
-    scalar = model.jnt_type != _C.mjtJoint.mjJNT_BALL
-    for kind, limited, ends, margin in (
-        ("joint", model.jnt_limited & scalar, model.jnt_range, model.jnt_margin),
-        ("tendon", model.tendon_limited, model.tendon_range, model.tendon_margin),
-    ):
-        if np.any(limited & (np.ptp(ends, axis=1) < 2 * margin)):
-            yield f"one of two limits that a {kind} meets at once", _WITHIN_MARGIN
-    for of in _SOFT:
-        ref = getattr(model, of.format("solref"))
-        low, high, width = getattr(model, of.format("solimp"))[:, :3].T
-        if np.any((ref[:, 0] > 0) != (ref[:, 1] > 0)):
-            yield "MuJoCo's default in place of a solref of mixed signs", _ONE_SIGN
-        if np.any((low > high) | ((width < 1e-15) & (low != high))):  # mjMINVAL
-            yield "the first number of a solimp that does not rise", _RISING
-    if model.opt.enableflags & _C.mjtEnableBit.mjENBL_SLEEP:
-        yield "sleeping bodies", 'remove <flag sleep="enable"/>'
-    if model.opt.noslip_iterations:
-        yield "noslip_iterations", "remove it"
-    if stops_early(model):
-        few = f"where C stops after so few iterations ({model.opt.iterations}), with "
-        if model.opt.solver == _C.mjtSolver.mjSOL_CG:
-            yield few + "conjugate gradients", _GO_ON
-        if model.opt.cone == _C.mjtCone.mjCONE_ELLIPTIC and any(geom_pairs(model)):
-            yield few + "elliptic cones", _GO_ON
-    if model.opt.disableactuator:
-        yield "disabled groups of actuators", "remove actuatorgroupdisable, or those actuators"
-    for flag, values in (("spring", "stiffness"), ("damper", "damping")):
-        if _is_off(model, flag):
-            yield f'parts of <flag {flag}="disable"/>', f"remove it, and give no {values}"
-    for flag in ("nativeccd", "multiccd"):
-        if _is_off(model, flag):
-            yield f'<flag {flag}="disable"/>', "remove it"
-    # MJX adds up the forces on a body of rows that are not there.
-    constraint = _is_off(model, "constraint")
-    if constraint and not _is_off(model, "contact") and any(geom_pairs(model)):
-        yield '<flag constraint="disable"/> for contacts', 'add contact="disable" to it'
-    if (constraint or _is_off(model, "equality")) and np.isin(model.eq_type, _HOLDS).any():
-        yield '<flag equality="disable"/> for a connect or a weld', 'give it active="false"'
-    if model.opt.integrator == _C.mjtIntegrator.mjINT_DISCRETE:
-        yield "the integrator INT_DISCRETE", _REMEDIES["INT_IMPLICIT"]

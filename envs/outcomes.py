@@ -1,14 +1,20 @@
 """Checks of what a task's methods return, while they are traced."""
 
+from collections.abc import Callable
 from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.checks import require
 from mjx_reinforce.engine.contract import check_shape, in_words, shape_of
 from mjx_reinforce.envs.models import RANDOM
+from mjx_reinforce.envs.refusals import UnsupportedError
+
+#: So many draws show what a task moves.
+_DRAWS = 8
 
 
 def check_start(name: str, start: object, sizes: tuple[int, int]) -> tuple[Any, Any]:
@@ -60,6 +66,36 @@ def check_episode(name: str, episode: object, model: MjModel) -> dict[str, jax.A
             check_shape(quantity, value, field.shape)
             arrays[key] = arrays[key].astype(field.dtype)
     return arrays
+
+
+def check_centers(
+    name: str, randomize: Callable[[jax.Array], dict[str, Any]], center: jax.Array, model: MjModel
+) -> None:
+    """Checks that ``randomize`` moves no center of mass that MuJoCo compiled to be a body's origin.
+
+    The inertia matrix then has no entries in which the moved center would show. The bodies that it
+    moves are those of a few draws.
+
+    Args:
+      name: of the task.
+      randomize: of the task; it replaces ``body_ipos``.
+      center: [nbody, 3] the model's ``body_ipos``, in the precision of JAX.
+      model: an ``MjModel``.
+
+    Raises:
+      UnsupportedError: it does.
+    """
+    with jax.ensure_compile_time_eval():
+        keys = jax.random.split(jax.random.key(0), _DRAWS)
+        drawn = np.asarray(jax.vmap(lambda key: jnp.asarray(randomize(key)["body_ipos"]))(keys))
+    moved = np.any(drawn != np.asarray(center), axis=(0, 2))
+    fixed = np.flatnonzero(moved & (model.body_simple == 1) & (model.body_dofnum > 1))
+    if fixed.size:
+        names = ", ".join(model.body(int(body)).name or f"number {body}" for body in fixed)
+        raise UnsupportedError(
+            f"body_ipos of {name}.randomize moves the center of mass of a body at whose origin "
+            f'MuJoCo took it to be ({names}); write <body simple="false"> in the model'
+        )
 
 
 def check_outcome(name: str, outcome: object) -> tuple[Any, Any, dict[str, Any]]:

@@ -5,7 +5,7 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
@@ -14,6 +14,16 @@ from mjx_reinforce.settings.flags import run_command
 
 if TYPE_CHECKING:
     from mjx_reinforce.engine.base import MjModel
+
+
+#: What a class says of a model whose first key frame has controls.
+_HOME = """\
+        # An untrained policy acts in the middle of this space: on what holds the key frame.
+        # Actions beyond it are allowed; MuJoCo clamps them to ctrlrange.
+        self.home = self.mj_model.key_ctrl[0]
+        reach = np.where(limited, self.unit / 2, np.inf)
+        self.action_space = Box(self.home - reach, self.home + reach)
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +59,7 @@ def write_class(settings: NewSettings) -> None:
         raise ValueError(f"{output} must be in the folder of {xml}, where it looks for the model")
     check_output(output, settings.overwrite, ".py")
     from mjx_reinforce.envs import models
+    from mjx_reinforce.envs.instability import instability
 
     path = str(xml if xml.parent != Path() else Path.cwd() / xml)
     model = models.load_model(path)
@@ -56,6 +67,8 @@ def write_class(settings: NewSettings) -> None:
     write_bytes(output, class_source(model, xml.name, output.stem).encode())
     module = output.stem
     train = f"python -m mjx_reinforce.train --env {module}:{_title(module)} --output {module}_run"
+    if (warning := instability(model)) is not None:
+        print(warning)
     print(f"{output}: write its reward, then, in its folder: {train}")
 
 
@@ -75,6 +88,7 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
     if not all(joints):
         observed = ["qpos[7:]" if moves else "qpos"]
     observed = ["qpos[2:7]"] * moves + observed + ["qvel"] + ["sensordata"] * (model.nsensor > 0)
+    at_home = bool(model.nkey and model.key_ctrl[0].any())
     parts = "new_task.txt", "new_walk.txt" if moves else "new_hold.txt"
     template = "".join(Path(__file__).with_name(part).read_text("utf-8") for part in parts)
     return template.format(
@@ -88,7 +102,22 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
         pose="self.mj_model.key_qpos[0]" if model.nkey else "self.mj_model.qpos0",
         observed="".join(f"                data.{part},\n" for part in observed),
         about="\n".join(_about(model)),
+        home=_HOME if at_home else "",
+        imports="from mjx_reinforce import Box\n" if at_home else "",
+        effort="(action - self.home)" if at_home else "action",
+        body=int(model.jnt_bodyid[0]) if moves else 0,
+        up=_up(model) if moves else "",
     )
+
+
+def _up(model: "MjModel") -> list[float]:
+    """Returns which way is up [3], in the axes of a robot that stands in its first pose."""
+    import mujoco
+
+    data: Any = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
+    data.qpos[:] = model.key_qpos[0] if model.nkey else model.qpos0
+    mujoco.mj_kinematics(model, data)  # pyright: ignore[reportAttributeAccessIssue]
+    return data.xmat[model.jnt_bodyid[0]].reshape(3, 3)[2].round(3).tolist()
 
 
 def _title(module: str) -> str:

@@ -30,6 +30,7 @@ from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.engine.play import native
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import MujocoEnv
+from mjx_reinforce.envs.refusals import UnsupportedError
 
 mujoco: Any = importlib.import_module("mujoco")  # pyright does not know what is in it
 
@@ -170,7 +171,7 @@ def by_machine_code(model: Any, start: Start, steps: int) -> list[np.ndarray]:
 
 
 def load(parts: Sequence[Mechanism]) -> Any:
-    """Returns one model of mechanisms that do not touch; raises ValueError as ``make`` does."""
+    """Returns one model of mechanisms that do not touch; UnsupportedError is a refusal of ours."""
     spec = mujoco.MjSpec.from_string(f"<mujoco>{parts[-1].option}</mujoco>")
     contacts = 0
     for i, each in enumerate(parts):
@@ -189,7 +190,7 @@ def refusal(parts: Sequence[Mechanism]) -> str:
     """Returns why ``make`` refuses some mechanisms, or nothing."""
     try:
         load(parts)
-    except ValueError as error:
+    except UnsupportedError as error:  # any other is a mistake, and ends this program
         return str(error)
     return ""
 
@@ -214,7 +215,7 @@ def compare(together: Sequence[Mechanism], native: bool = False) -> Iterator[Cel
     parts = [motor, *together]
     try:
         model = load(parts)
-    except ValueError:
+    except UnsupportedError:
         refused = {each: words for each in together if (words := refusal([motor, each]))}
         for each, words in refused.items():
             yield from (Cell(*each.title, start, np.nan, words) for start in each.starts)

@@ -62,6 +62,8 @@ class Display(Observer[Driver]):
             disable=not self.console.is_terminal,
         )
         self._task = self._bar.add_task("compiling", total=None, done="", left="")
+        #: What is wrong with the user's model, and whether numbers that are not finite were told.
+        self._of_model, self._told = "", False
 
     def __enter__(self) -> "Display":
         """Starts drawing."""
@@ -86,6 +88,12 @@ class Display(Observer[Driver]):
         with suppress(OSError):
             whole |= not self.console.is_terminal
             self.console.print(text, style=style, highlight=False, soft_wrap=whole)
+
+    def warn_of_model(self, instability: str | None) -> None:
+        """Says that a model explodes in C MuJoCo, now and where its run is stopped."""
+        if instability is not None:
+            self._of_model = instability
+            self.say(instability, "yellow")
 
     def show_commands(self, commands: Mapping[str, str]) -> None:
         """Prints command lines after what they do; each is one line, to be copied."""
@@ -116,7 +124,9 @@ class Display(Observer[Driver]):
             }
         )
         if summary["status"] == "stopped":
-            self.say(f"stopped: {summary['reason']}", "red")
+            self.say(
+                "; ".join(filter(None, (f"stopped: {summary['reason']}", self._of_model))), "red"
+            )
 
     def start(self, compile_seconds: float) -> None:
         """Marks the end of compilation, from where the time left is counted."""
@@ -135,8 +145,9 @@ class Display(Observer[Driver]):
             )
 
     def updated(self, driver: Driver, met: np.ndarray) -> None:
-        """Says in a line which seeds met numbers that are not finite, if any did."""
-        if met.any():
+        """Says once which seeds met numbers that are not finite; the last table counts them."""
+        if met.any() and not self._told:
+            self._told = True
             said = record.describe_nonfinite(met, driver.config.first_seed, driver.updates())
             self.say(said, "yellow")
 
@@ -216,6 +227,9 @@ def summary_table(summary: dict[str, Any]) -> Table:
     if failed := summary["seeds_nonfinite_at_end"]:
         row = f"{failed:,} of {num_seeds}, worse than every other"
         table.add_row("seeds whose return is not finite", row)
+    if broken := sum(summary["nonfinite"]):
+        row = f"{broken:,}, of all seeds together"
+        table.add_row("updates with values not finite", row)
     if (at_end := summary["seeds_solved_at_end"]) is not None:
         row = f"{at_end:,} of {num_seeds} at the end, {summary['seeds_ever_solved']:,} ever"
         table.add_row(f"seeds at {summary['threshold']:,g}, the task's threshold", row)

@@ -188,6 +188,7 @@ def perform(
         env = None if envs.is_ours(first.env) else envs.make_set(first.env, first.env_set)
         try:
             configure_jax()
+            from mjx_reinforce.envs.instability import instability
             from mjx_reinforce.runs.conduct import conduct
             from mjx_reinforce.runs.plan import describe, prepare
             from mjx_reinforce.runs.saving import RunFiles, SweepFiles
@@ -196,6 +197,8 @@ def perform(
 
         display = _display(quiet=quiet)
         interrupt.restore_screen(display.console.show_cursor)
+        if (model := getattr(env, "mj_model", None)) is not None:
+            display.warn_of_model(instability(model))
         with display.console.status("writing the simulation out"):
             prepared = prepare(design, known, env, display.say)
         display.say(describe(prepared))

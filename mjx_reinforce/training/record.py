@@ -149,7 +149,7 @@ def broken_in_a_row(before: np.ndarray, metrics: Arrays) -> np.ndarray:
 
 
 def describe_nonfinite(met: np.ndarray, first_seed: int, updates: int) -> str:
-    """Returns one line about ``nonfinite_updates`` of which at least one is not 0.
+    """Returns a line about the first ``nonfinite_updates`` of a run, of which some are not 0.
 
     Args:
       met: [S] how many of a block, of each seed.
@@ -158,9 +158,12 @@ def describe_nonfinite(met: np.ndarray, first_seed: int, updates: int) -> str:
     """
     seeds = (first_seed + np.flatnonzero(met)).tolist()
     named = ", ".join(map(str, seeds[:_NAMED])) + (", ..." if len(seeds) > _NAMED else "")
+    numbers = "number" if len(seeds) == 1 else "numbers"
     return (
-        f"up to update {updates}: {len(seeds):,} of {len(met):,} seeds met numbers that are not "
-        f"finite or beyond 1e10 ({named}), in {met.sum():,} updates"
+        f"up to update {updates}, {len(seeds):,} of {len(met):,} seeds ({numbers} {named}) met "
+        "values that are not finite or beyond 1e10. Such an episode counts as the worst of its "
+        "update. This line comes once; the number of such updates comes at the end. If they are "
+        "many, give the model a smaller timestep or more armature, or lower --learning-rate"
     )
 
 

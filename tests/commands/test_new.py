@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from places import ROOT
 
+import mjx_reinforce as mr
 from mjx_reinforce import envs, new
 
 EXAMPLES = ROOT / "experiments" / "examples"
@@ -99,11 +100,55 @@ def test_a_walker_starts_in_its_key_frame(tmp_path, monkeypatch):
     assert 0 < np.abs(qvel).max() < 0.1
     state = env.set_state(jnp.asarray(home), qvel)
     np.testing.assert_allclose(state.obs[:6], home[2:], atol=1e-6)
-    stands = types.SimpleNamespace(qpos=home)
-    fallen = types.SimpleNamespace(qpos=home + np.array([env.dt, 0, -0.1, 0, 0, 0, 0, 0]))
-    found = [env.outcome(stands, after, jnp.zeros(1))[:2] for after in (stands, fallen)]
-    assert found == [(1, False), (pytest.approx(2), True)]
+    upright = np.array([np.eye(3), [[-0.28, 0, 0.96], [0, 1, 0], [-0.96, 0, -0.28]]])
+    stands = types.SimpleNamespace(qpos=home, xmat=upright)
+    moved = home + np.array([env.dt, 0, -0.1, 0, 0, 0, 0, 0])
+    fallen = types.SimpleNamespace(qpos=moved, xmat=upright)
+    tilted = types.SimpleNamespace(qpos=home, xmat=np.array([np.eye(3), np.eye(3)]))
+    action = jnp.array([-0.5])  # that of the key frame costs nothing
+    found = [env.outcome(stands, after, action)[:2] for after in (stands, fallen, tilted)]
+    assert found == [(1, False), (pytest.approx(2), True), (1, True)]
     lint("kept.py")
+
+
+SERVO = """<mujoco><compiler angle="radian"/><option timestep="0.002"/><worldbody><body pos="0 0 1">
+  <joint name="j" axis="0 1 0" range="-1 3" damping="1"/><geom size=".05" pos=".2 0 0" mass=".1"/>
+  </body></worldbody><actuator><position joint="j" kp="100" ctrlrange="-1 3"/>
+  <motor joint="j" gear="0.0001" ctrlrange="0 255"/></actuator>
+  <keyframe><key qpos="2.2" ctrl="2.2 0"/></keyframe></mujoco>"""
+
+
+@pytest.mark.slow
+def test_an_untrained_policy_holds_the_key_frame(tmp_path, monkeypatch):
+    """The middle of ctrlrange, 1 rad and 127.5, is elsewhere; and a large unit costs no more."""
+    (tmp_path / "servo.xml").write_text(SERVO)
+    monkeypatch.chdir(tmp_path)
+    write(monkeypatch, "servo.xml")
+    monkeypatch.syspath_prepend(tmp_path)
+    env = envs.make("servo:Servo")
+    learner = mr.reinforce(env)
+    actor = learner.init(jax.random.key(0)).actor
+    step, state = jax.jit(env.step), env.reset(jax.random.key(0))
+    for _ in range(env.max_episode_steps):
+        outputs = mr.act(learner.policy, actor, state.obs)
+        state = step(state, learner.policy.distribution.mode(outputs))
+        assert state.obs[0] == pytest.approx(2.2, abs=0.1)
+        assert state.metrics["reward_control"] > -0.01
+    assert env.outcome(state.pipeline_state, state.pipeline_state, jnp.array([2.2, 255.0]))[2][
+        "reward_control"
+    ] == pytest.approx(-0.04)
+    lint("servo.py")
+
+
+def test_an_unstable_model_is_named(tmp_path, monkeypatch, capsys):
+    (tmp_path / "stiff.xml").write_text(SERVO.replace('kp="100"', 'kp="1e9"'))
+    monkeypatch.chdir(tmp_path)
+    write(monkeypatch, "stiff.xml")
+    assert "unstable in C MuJoCo itself: under no control it explodes after 0.0" in (
+        said := capsys.readouterr().out
+    )
+    assert "(DOF 0, joint 'j'); try a smaller timestep" in said
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["stiff.py", "stiff.xml"]
 
 
 WRONG = {

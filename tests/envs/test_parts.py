@@ -14,6 +14,7 @@ from mjx_reinforce.engine.play.episode import episode_keys
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import MujocoEnv
 from mjx_reinforce.envs.in_mujoco import InMujoco
+from mjx_reinforce.envs.refusals import UnsupportedError
 from mjx_reinforce.export.policy_files import Player
 from mjx_reinforce.learning import normalize
 from mjx_reinforce.learning.policy import Actor
@@ -109,7 +110,7 @@ def test_what_is_no_model_is_refused():
     read = mujoco.MjSpec.from_string  # pyright: ignore[reportAttributeAccessIssue]
     for named, what in (("", "the model"), (' model="arm"', "the model 'arm'")):
         for other in (read(f"<mujoco{named}/>"), read(f"<mujoco{named}/>").compile()):
-            with pytest.raises(ValueError, match=f"^{what} has no actuators"):
+            with pytest.raises(ValueError, match=f"{what}: it has no actuators; add"):
                 Box(xml_file=other)
 
 
@@ -221,6 +222,71 @@ def test_machine_code_plays_what_was_drawn(reach):
             state = step(state, action)
             np.testing.assert_allclose(reward, state.reward, rtol=2e-3, atol=2e-3)
     assert len(set(np.asarray(played.observation[0, :, -2]).tolist())) == 4
+
+
+FREE = """<mujoco><worldbody><body name="cube" pos="0 0 2" {}><freejoint/>{}
+  <geom size=".1" mass="1"/></body>
+  <body name="arm" pos="1 0 1"><joint name="h" axis="0 1 0"/>
+    <geom size=".05" pos=".1 0 0" mass="1"/></body>
+  <body name="top" pos="2 0 1"><joint axis="0 1 0"/><geom size=".05" mass="1"/></body>
+  </worldbody><actuator><motor joint="h"/></actuator></mujoco>"""
+
+
+class Shifted(Box):
+    """The center of mass of a body is drawn, and what it weighs."""
+
+    body, mass = 1, 1.0
+
+    def randomize(self, rng):
+        """Moves it by 3 cm, in each draw."""
+        return {
+            "body_ipos": self.model.body_ipos.at[self.body, 0].add(0.03),
+            "body_mass": self.model.body_mass.at[self.body].set(self.mass),
+        }
+
+    def initial(self, rng):
+        """Spins."""
+        return jnp.asarray(self.mj_model.qpos0), jnp.arange(1.0, 1.0 + self.mj_model.nv)
+
+    def observe(self, data):
+        """Shows where all is, and the centers of mass."""
+        return jnp.concatenate([data.qpos, data.qvel, data.subtree_com.ravel()])
+
+    def outcome(self, before, data, action):
+        """Earns nothing."""
+        return 0.0, False, {}
+
+
+def test_a_random_center_of_mass_needs_a_body_that_is_not_simple():
+    """Where it is not that of the cube, the task may stay as it is."""
+    read = mujoco.MjModel.from_xml_string  # pyright: ignore[reportAttributeAccessIssue]
+    refused = r"center of mass of a body .* \(cube\); write <body simple=\"false\">"
+    with pytest.raises(UnsupportedError, match=refused):
+        jax.eval_shape(Shifted(xml_file=read(FREE.format("", ""))).reset, jax.random.key(0))
+    Arm = type("Arm", (Shifted,), {"body": 2})  # noqa: N806
+    jax.eval_shape(Arm(xml_file=read(FREE.format("", ""))).reset, jax.random.key(0))
+
+
+@pytest.mark.slow
+def test_a_random_center_of_mass_is_that_of_the_compiled_model():
+    """Here, and in C MuJoCo, which keeps which frames were the same when it compiled."""
+    read = mujoco.MjModel.from_xml_string  # pyright: ignore[reportAttributeAccessIssue]
+    there = '<inertial pos=".03 0 0" mass="1.5" diaginertia=".004 .004 .004"/>'
+    model = read(FREE.format("", there))
+    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
+    data.qvel[:] = np.arange(1.0, 1.0 + model.nv)
+    with jax.enable_x64(True):
+        Heavy = type("Heavy", (Shifted,), {"mass": 1.5})  # noqa: N806
+        env = Heavy(xml_file=read(FREE.format('simple="false"', "")))
+        peer, state, step = InMujoco(env), env.reset(jax.random.key(0)), jax.jit(env.step)
+        peer.reset(jax.random.key(0))
+        for _ in range(5):
+            mujoco.mj_step(model, data, 2)  # pyright: ignore[reportAttributeAccessIssue]
+            state = step(state, jnp.zeros(1))
+            seen = peer.step(np.zeros(1))[0]
+        theirs = np.concatenate([data.qpos, data.qvel, data.subtree_com.ravel()])
+    np.testing.assert_allclose(state.obs, theirs, atol=1e-9)
+    np.testing.assert_allclose(seen, theirs, atol=1e-9)
 
 
 @pytest.mark.parametrize(

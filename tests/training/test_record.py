@@ -171,11 +171,13 @@ def test_a_run_is_hopeless_if_all_that_train_are():
     assert not hopeless([5, 9, 0], [10, 10, 10], block=5)
 
 
-def test_a_block_of_broken_updates_is_one_line():
+def test_broken_updates_are_one_line_with_the_remedy():
     met = np.repeat([0, 2], [994, 6])
     assert measured.describe_nonfinite(met, 7, 9) == (
-        "up to update 9: 6 of 1,000 seeds met numbers that are not finite or beyond 1e10 "
-        "(1001, 1002, 1003, 1004, 1005, ...), in 12 updates"
+        "up to update 9, 6 of 1,000 seeds (numbers 1001, 1002, 1003, 1004, 1005, ...) met values "
+        "that are not finite or beyond 1e10. Such an episode counts as the worst of its update. "
+        "This line comes once; the number of such updates comes at the end. If they are many, give "
+        "the model a smaller timestep or more armature, or lower --learning-rate"
     )
 
 
@@ -239,6 +241,7 @@ def test_the_end_table_has_counts(monkeypatch):
     more |= {"useful_step_fraction": 0.9999, "compile_seconds": 1.0, "run_seconds": 2.0}
     more |= {
         "threshold": 950.0,
+        "nonfinite": [2, 0, 83],
         "final_test_returns": [584.4] * 4,
         "best_test_returns": [572.0] * 4,
     }
@@ -249,7 +252,8 @@ def test_the_end_table_has_counts(monkeypatch):
     display.Display().show_summary(few, Path("t"))
     assert "586.8 (no interval: too few seeds)" in " ".join(console.file.getvalue().split())
     console = screen(80)
-    display.Display().show_summary(summarize(history, 950.0) | more, Path("t/[bold]x"))
+    ended = summarize(history, 950.0) | more
+    display.Display().show_summary(ended, Path("t/[bold]x"))
     written = " ".join(console.file.getvalue().split())
     for text in (
         "seeds at 950, the task's threshold │ 997 of 1,000 at the end, 997 ever",
@@ -261,11 +265,18 @@ def test_the_end_table_has_counts(monkeypatch):
     assert "(95%" in written
     assert "nan, 1000.0" in written
     assert "not finite │ 1 of 1,000" in written
+    assert "updates with values not finite │ 85, of all seeds together" in written
     assert "Files in t/[bold]x" in written
     assert "the picture is learning_curve.png" in written
     for command in ("watch", "report"):  # each on one line, to be copied
         assert f"python -m mjx_reinforce.{command} 't/[bold]x'\n" in console.file.getvalue()
     assert "100" not in written.replace("1000.0", "").replace("1,000", "")
+    shown = display.Display()
+    shown.warn_of_model(None)
+    shown.warn_of_model("this model is unstable")
+    console = shown.console = screen(200)
+    shown.show_summary(ended | {"status": "stopped", "reason": "nothing is finite"}, Path("t"))
+    assert "stopped: nothing is finite; this model is unstable" in console.file.getvalue()
 
 
 def evaluated(reward, mask, nonfinite_episodes):

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from mjx_reinforce.engine.physics import inertia
+from mjx_reinforce.engine.physics import impedance, inertia
 from mjx_reinforce.engine.physics.mjx_internals import jax_fields
 
 _MAX_ROWS_TOGETHER = 2
@@ -59,7 +59,7 @@ def solve_limits(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array
       The acceleration [nv], the limits' joint forces [nv] and the rows' forces [rows].
     """
     # The rows are made again here, so that nothing outside this branch needs them.
-    fields = jax_fields(mjx.make_constraint(model, data))
+    fields = jax_fields(impedance.make_constraint(model, data))
     joints = _limited_joints(model)
     dofs = np.asarray(model.jnt_dofadr)[joints]
     sign = [fields.efc_J[i, dof] for i, dof in enumerate(dofs)]

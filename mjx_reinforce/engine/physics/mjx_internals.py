@@ -5,9 +5,9 @@ No other file imports MJX's private modules or reads the private part of its dat
 - Names that MJX keeps private, here without underscore: the imports, and ``advance``.
 - Fields of ``mjx.Data`` that only MJX's JAX implementation has: ``jax_fields``, ``with_fields``,
   ``rows_of``, ``with_rows``, ``with_contact``, ``Simulation``.
-- Functions of MJX in which a name is given another meaning: ``collision_with``, ``data_with`` and
-  ``fenced``. They would do nothing, silently, if MJX stopped looking that name up; ``check_lookup``
-  raises then.
+- Functions of MJX in which a name is given another meaning: ``collision_with``, ``data_with``,
+  ``rows_with`` and ``fenced``. They would do nothing, silently, if MJX stopped looking that name
+  up; ``check_lookup`` raises then.
 
 ``tests/engine/physics/test_mjx_internals.py`` holds a hash of each MJX function that this package
 replaces or whose source it depends on: a new MJX fails there first.
@@ -32,6 +32,7 @@ from mujoco.mjx._src import (
     collision_driver,
     collision_primitive,
     collision_types,
+    constraint,
     forward,
     io,
     math,
@@ -43,7 +44,9 @@ from mujoco.mjx._src import (
 advance = forward._advance
 collider = collision_primitive.collider
 geom_pairs = collision_driver.geom_pairs
+has_collider = collision_driver.has_collision_fn
 make_frame, quat_mul_axis = math.make_frame, math.quat_mul_axis
+kbi = constraint._kbi
 muscle_gain = support.muscle_gain
 solve_m = smooth.solve_m
 Collision = collision_types.Collision
@@ -59,10 +62,14 @@ TESTED_VERSIONS = {"mujoco": "4.0", "mujoco-mjx": "3.17"}
 def check_lookup(function: Callable[..., Any], name: str) -> None:
     """Checks that a function of MJX looks up a global name, so that it sees another meaning.
 
+    The functions that it defines may do so too.
+
     Raises:
       RuntimeError: it does not.
     """
-    if name not in inspect.unwrap(function).__code__.co_names:
+    code = inspect.unwrap(function).__code__
+    inner = [part for part in code.co_consts if isinstance(part, types.CodeType)]
+    if not any(name in part.co_names for part in (code, *inner)):
         tested = " and ".join(f"{package}=={it}.*" for package, it in TESTED_VERSIONS.items())
         raise RuntimeError(
             f"{function.__module__}.{function.__name__} does not look up {name}, which "
@@ -73,6 +80,7 @@ def check_lookup(function: Callable[..., Any], name: str) -> None:
 check_lookup(mjx.collision, "_COLLISION_FUNC")
 check_lookup(collision_driver.make_condim, "_COLLISION_FUNC")
 check_lookup(io._make_data_jax, "collision_driver")
+check_lookup(mjx.make_constraint, "_kbi")
 check_lookup(scan.flat, "_nvmap")
 check_lookup(scan.body_tree, "_nvmap")
 
@@ -82,6 +90,12 @@ def geom_groups(model: mjx.Model) -> Iterator[tuple[int, int, int]]:
     for key, pairs in collision_driver._geom_groups(model).items():
         for first, second, _ in pairs:
             yield int(key.condim), first, second
+
+
+def convex_meshes(model: mjx.Model) -> dict[int, Any]:
+    """Returns MJX's convex meshes, of those that may touch something, by their numbers."""
+    meshes = cast(Any, model)._impl.mesh_convex
+    return {number: mesh for number, mesh in enumerate(meshes) if mesh is not None}
 
 
 _Colliders = dict[tuple[mjx.GeomType, mjx.GeomType], Callable[..., Any]]
@@ -99,9 +113,23 @@ def collision_with(
       functions: from MJX's table, a ``collider`` for each pair of types of geoms in MJX's order,
         makes the copy's.
     """
-    plain = inspect.unwrap(mjx.collision)
     table = functions(dict(collision_driver._COLLISION_FUNC))
-    return types.FunctionType(plain.__code__, {**plain.__globals__, "_COLLISION_FUNC": table})
+    return _copy(mjx.collision, _COLLISION_FUNC=table)
+
+
+def rows_with(kbi: Callable[..., Any]) -> Callable[[mjx.Model, mjx.Data], mjx.Data]:
+    """Returns a copy of ``mjx.make_constraint`` with another stiffness, damping and impedance.
+
+    Args:
+      kbi: in place of MJX's, see ``kbi``.
+    """
+    return _copy(mjx.make_constraint, _kbi=kbi)
+
+
+def _copy(function: Callable[..., Any], **meanings: Any) -> Callable[..., Any]:
+    """Returns a copy of a function of MJX in which global names have other meanings."""
+    plain = inspect.unwrap(function)
+    return types.FunctionType(plain.__code__, {**plain.__globals__, **meanings})
 
 
 def data_with(functions: Callable[[_Colliders], _Colliders]) -> Callable[..., mjx.Data]:
@@ -113,11 +141,10 @@ def data_with(functions: Callable[[_Colliders], _Colliders]) -> Callable[..., mj
     Returns:
       (model, device) -> data
     """
-    table, names = functions(dict(collision_driver._COLLISION_FUNC)), collision_driver.__dict__
-    plain, make = collision_driver.make_condim, io._make_data_jax
-    room = types.FunctionType(plain.__code__, {**names, "_COLLISION_FUNC": table})
-    driver = types.SimpleNamespace(make_condim=room)
-    return types.FunctionType(make.__code__, {**make.__globals__, "collision_driver": driver})
+    table = functions(dict(collision_driver._COLLISION_FUNC))
+    make_condim = _copy(collision_driver.make_condim, _COLLISION_FUNC=table)
+    driver = types.SimpleNamespace(make_condim=make_condim)
+    return _copy(io._make_data_jax, collision_driver=driver)
 
 
 _lock = threading.RLock()

@@ -16,6 +16,7 @@ from jax import lax
 from mujoco import mjx
 
 from mjx_reinforce.engine.physics import mjx_internals
+from mjx_reinforce.engine.physics.impedance import make_constraint as make_rows
 from mjx_reinforce.engine.physics.mjx_internals import jax_fields, rows_of, with_contact, with_rows
 from mjx_reinforce.engine.scalar import is_written_out, short_scan
 
@@ -33,9 +34,9 @@ def make_constraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     contact = jax_fields(data).contact
     none = model.opt.disableflags & mjx.DisableBit.CONSTRAINT or not contact.dim.size
     if none or not is_written_out():
-        return _with_changes(model, mjx.make_constraint(model, data))
+        return _with_changes(model, make_rows(model, data))
 
-    parts = [rows_of(mjx.make_constraint(model, with_contact(data, contact, np.zeros(0, int))))]
+    parts = [rows_of(make_rows(model, with_contact(data, contact, np.zeros(0, int))))]
     for dim in (1, 3, 4, 6):
         chosen = np.flatnonzero(contact.dim == dim)
         if chosen.size:
@@ -56,7 +57,7 @@ def _with_changes(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
     def speed(qpos: jax.Array) -> jax.Array:
         moved = mjx.com_pos(model, mjx.kinematics(model, no_contact.replace(qpos=qpos)))
-        return jax_fields(mjx.make_constraint(model, moved)).efc_J[:count] @ data.qvel
+        return jax_fields(make_rows(model, moved)).efc_J[:count] @ data.qvel
 
     _, change = jax.jvp(speed, (data.qpos,), (_rate(model, data),))
     jacobian, mass, reference, *others = rows_of(data)
@@ -86,7 +87,7 @@ def _contact_rows(model: mjx.Model, data: mjx.Data, dim: int, chosen: np.ndarray
     def make(_: None, one: Any) -> tuple[None, list[jax.Array]]:
         def touching() -> list[jax.Array]:
             single = jax.tree.map(lambda x: x[None], one)
-            return rows_of(mjx.make_constraint(alone, with_contact(data, single, np.array([dim]))))
+            return rows_of(make_rows(alone, with_contact(data, single, np.array([dim]))))
 
         shapes = jax.eval_shape(touching)
         return None, lax.cond(

@@ -17,6 +17,7 @@ from mjx_reinforce.engine.physics import contact_rows, contacts, rows
 from mjx_reinforce.engine.physics.mjx_internals import jax_fields, with_contact
 from mjx_reinforce.engine.scalar import writing_out
 from mjx_reinforce.envs import models
+from mjx_reinforce.envs.refusals import UnsupportedError
 
 PAIR = """
 <mujoco>
@@ -194,7 +195,7 @@ def test_the_search_along_a_capsule_is_written_out(all_pairs):
 @pytest.mark.parametrize("pair", ["sphere-ellipsoid", "cylinder-cylinder"])
 def test_pairs_that_mjx_gets_wrong_are_refused_if_they_can_meet(pair):
     model = compiled(*pair.split("-"))
-    with pytest.raises(ValueError, match=r"which MJX finds in ten steps.*; keep that pair apart"):
+    with pytest.raises(UnsupportedError, match=r"which MJX finds in ten steps.*; keep those apart"):
         models.to_mjx(model, "pair")
     model.geom_contype[0] = model.geom_conaffinity[0] = 0
     models.to_mjx(model, "pair")

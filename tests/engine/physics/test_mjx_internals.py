@@ -23,7 +23,7 @@ from experiments.checks import matrix
 from experiments.checks.mechanisms import MODELS, mechanisms
 from mjx_reinforce.engine import physics
 from mjx_reinforce.engine.physics import contacts, mjx_internals
-from mjx_reinforce.envs import models
+from mjx_reinforce.envs import models, refusals
 from mjx_reinforce.envs.base import MujocoEnv
 
 TOUCHING = """
@@ -50,6 +50,10 @@ SOURCES = {
     "forward._advance": ("999ba748df645057", "mjx_internals.advance (step)"),
     "constraint._efc_limit_slide_hinge": ("0a9ef2da54b801f4", "limits"),
     "constraint.make_constraint": ("08ea07ad04cd2554", "step, rows (which rows)"),
+    "constraint._kbi": ("16350ddae982313c", "impedance"),
+    "collision_driver.make_condim": ("86d240a22d3c85f7", "models.load_model (which numerics)"),
+    "sensor.sensor_acc": ("54ba32544e29725b", "models.to_mjx (which kinds it leaves alone)"),
+    "smooth.rne_postconstraint": ("bd9282d1448b35f4", "models.to_mjx (which equalities it reads)"),
     "solver.solve": ("e052e9cdd4255a97", "newton.solve_newton"),
     "smooth.solve_m": ("58a57c2a3ed4519f", "limits.solve_limits"),
     "collision_driver.collision": ("0b7104d7b1479df8", "mjx_internals.collision_with"),
@@ -177,7 +181,7 @@ def test_every_state_of_mujoco_is_accounted_for():
     bits = {name for name in dir(mujoco.mjtState) if name.startswith("mjSTATE_")}
     combined = {f"mjSTATE_{name}" for name in ("FULLPHYSICS", "INTEGRATION", "PHYSICS", "USER")}
     named = {"qacc_warmstart": "warmstart"}
-    known = (*models.CARRIED, "ctrl", *models.CONSTANT, *models.NOT_CARRIED)
+    known = (*models.CARRIED, "ctrl", *models.CONSTANT, *refusals.NOT_CARRIED)
     assert {f"mjSTATE_{named.get(name, name).upper()}" for name in known} == bits - combined
 
 

@@ -1,0 +1,274 @@
+"""What of a model would be simulated otherwise than by C MuJoCo, all at once and in words."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco import MjModel, mjx  # pyright: ignore[reportAttributeAccessIssue]
+
+from mjx_reinforce.engine.checks import BadEnvironmentError
+from mjx_reinforce.engine.physics.contacts import UNLIKE_C, UNLIKE_C_WITHIN_MARGIN
+from mjx_reinforce.engine.physics.early_stop import stops_early
+from mjx_reinforce.engine.physics.mjx_internals import (
+    convex_meshes,
+    geom_groups,
+    geom_pairs,
+    has_collider,
+)
+
+#: MuJoCo's own names; it is a C extension without stubs.
+_C: Any = mujoco
+_GEOM, _DISABLED, _ENABLED = _C.mjtGeom, _C.mjtDisableBit, _C.mjtEnableBit
+#: What MJX does not carry: its size in the model, what it is, and how to do without.
+NOT_CARRIED = {
+    "history": ("nhistory", "delays", "remove delay and interval from actuators and sensors"),
+    "plugin": ("nplugin", "plugins", "remove them"),
+    "plastic": ("nplastic", "plastic springs", "remove springyield"),
+}
+_ON_JOINT = "give it to the joint, times the square of gear"
+_ONE_NUMBER = "give one number"
+_GO_ON = 'set <option iterations="100" ls_iterations="50"/>, or solver="Newton" cone="pyramidal"'
+#: What else MJX ignores in silence.
+_IGNORED = (
+    ("actuator_armature", "the armature of an actuator", _ON_JOINT),
+    ("actuator_damping", "the damping of an actuator", _ON_JOINT),
+    ("actuator_dampingpoly", "the polynomial damping of an actuator", _ON_JOINT),
+    ("actuator_actearly", "actearly of an actuator", 'remove actearly="true"'),
+    ("jnt_stiffnesspoly", "the polynomial stiffness of a joint", _ONE_NUMBER),
+    ("dof_dampingpoly", "the polynomial damping of a joint", _ONE_NUMBER),
+    ("tendon_stiffnesspoly", "the polynomial stiffness of a tendon", _ONE_NUMBER),
+    ("tendon_dampingpoly", "the polynomial damping of a tendon", _ONE_NUMBER),
+    ("geom_adhesion", "adhesive geoms", "remove adhesion"),
+    ("pair_adhesion", "adhesive contact pairs", "remove adhesion"),
+    ("geom_surfacevel", "moving surfaces", "remove surfacevel"),
+    ("geom_fluid", "the fluid forces on ellipsoids", "remove fluidshape"),
+)
+#: Fields whose values are of a kind: MJX's kinds, and MuJoCo's.
+_KINDS = (
+    ("actuator_biastype", mjx.BiasType, _C.mjtBias),
+    ("actuator_dyntype", mjx.DynType, _C.mjtDyn),
+    ("actuator_gaintype", mjx.GainType, _C.mjtGain),
+    ("actuator_trntype", mjx.TrnType, _C.mjtTrn),
+    ("eq_type", mjx.EqType, _C.mjtEq),
+    ("sensor_type", mjx.SensorType, _C.mjtSensor),
+    ("wrap_type", mjx.WrapType, _C.mjtWrap),
+)
+#: The same of <option>.
+_OPTIONS = (
+    ("integrator", mjx.IntegratorType, _C.mjtIntegrator),
+    ("solver", mjx.SolverType, _C.mjtSolver),
+)
+#: Part of the name of a kind that MJX has not -> how to do without.
+_REMEDIES = {
+    "mjSOL_": 'set <option solver="Newton"/>',
+    "mjINT_": 'set <option integrator="implicitfast"/>',
+    "mjSENS_": "remove those sensors",
+    "mjTRN_BODY": "replace the adhesion actuators by friction (friction, condim of the geoms), or "
+    "by a <weld> equality",
+    "mjTRN_SLIDERCRANK": "replace the slider-crank by the <motor> of a joint, or make its rod a "
+    "body that a <connect> equality holds",
+    "_USER": "replace the user-defined actuators by <motor>, <position>, <velocity> or <muscle>",
+    "mjEQ_": "replace those equalities by <connect>, <weld>, <joint> or <tendon>",
+    "mjENBL_OVERRIDE": 'set <flag override="disable"/> and give geoms solref and solimp of their '
+    "own",
+    "mjENBL_": "take that <flag> out of <option>",
+}
+_ELSE = "remove it; MuJoCo's documentation lists what MJX supports under 'MJX, feature parity'"
+#: Fields of a model that say how stiff its constraints are.
+_STIFF = ("dof_{}", "eq_{}", "geom_{}", "jnt_{}", "pair_{}", "tendon_{}_lim", "tendon_{}_fri")
+#: A message names so many geoms, or pairs of them.
+_NAMED = 3
+
+
+class UnsupportedError(BadEnvironmentError):
+    """A model has what would be simulated otherwise than by C MuJoCo; the message says all of it.
+
+    This is the only error that means a refusal. Any other is a mistake, of the model's file or of
+    this package.
+    """
+
+
+def check_supported(model: MjModel, name: str, *others: str) -> None:
+    """Checks that a model can be simulated as by C MuJoCo.
+
+    Args:
+      model: the compiled model.
+      name: what a message calls it.
+      others: what else is wrong with it, each with its remedy.
+
+    Raises:
+      UnsupportedError: it cannot; the message has every reason, each with its remedy.
+    """
+    unlike = dict.fromkeys(f"{what}; {remedy}" for what, remedy in _reasons(model))
+    reasons = [*others, *unlike]
+    if len(reasons) == 1:
+        raise UnsupportedError(f"MJX cannot run {name}: {reasons[0]}")
+    if reasons:
+        listed = "".join(f"\n  {i}. {reason}" for i, reason in enumerate(reasons, start=1))
+        raise UnsupportedError(f"MJX cannot run {name}, for {len(reasons)} reasons:{listed}")
+
+
+def check_meshes(converted: mjx.Model, model: MjModel, name: str) -> None:
+    """Checks that MJX sees edges of each mesh that may touch something.
+
+    Raises:
+      UnsupportedError: it sees none, since a mesh is flat.
+    """
+    flat = [
+        model.mesh(i).name for i, mesh in convex_meshes(converted).items() if not len(mesh.edge)
+    ]
+    if flat:
+        remedy = "make them thicker, or replace them by boxes"
+        raise UnsupportedError(
+            f"MJX cannot run {name}: MJX sees no edges of flat meshes ({_listed(flat)}); {remedy}"
+        )
+
+
+def is_off(model: MjModel, flag: str) -> bool:
+    """Returns whether a flag of <option> is disabled."""
+    return bool(model.opt.disableflags & getattr(_DISABLED, f"mjDSBL_{flag.upper()}"))
+
+
+def may_touch(model: MjModel) -> bool:
+    """Returns whether some geoms of a model can push each other."""
+    off = is_off(model, "contact") or is_off(model, "constraint")
+    return not off and any(True for _ in geom_pairs(model))
+
+
+def _reasons(model: MjModel) -> Iterator[tuple[str, str]]:
+    """Yields what a model has that would be simulated otherwise, and how to do without it."""
+    for feature, remedy in _ignored(model):
+        yield f"MJX would ignore {feature}", remedy
+    yield from _missing(model)
+    if may_touch(model):
+        yield from _of_contacts(model)
+
+
+def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
+    """Yields what MJX would ignore in silence, and how to do without it."""
+    for field, feature, remedy in (*NOT_CARRIED.values(), *_IGNORED):
+        if np.any(getattr(model, field)):
+            yield feature, remedy
+    scalar = model.jnt_type != _C.mjtJoint.mjJNT_BALL
+    for kind, limited, ends, margin in (
+        ("joint", model.jnt_limited & scalar, model.jnt_range, model.jnt_margin),
+        ("tendon", model.tendon_limited, model.tendon_range, model.tendon_margin),
+    ):
+        both = np.flatnonzero(limited & (np.ptp(ends, axis=1) < 2 * margin))
+        if both.size:
+            names = _listed([getattr(model, kind)(i).name or f"number {i}" for i in both])
+            remedy = "give it a margin of at most half of its range"
+            yield f"one of two limits that a {kind} meets at once ({names})", remedy
+    refs = (getattr(model, of.format("solref")) for of in _STIFF)
+    if any(np.any((ref[:, 0] > 0) != (ref[:, 1] > 0)) for ref in refs):
+        signs = "give two positive numbers, or two that are not"
+        yield "MuJoCo's default in place of a solref of mixed signs", signs
+    if model.opt.enableflags & _ENABLED.mjENBL_SLEEP:
+        yield "sleeping bodies", 'remove <flag sleep="enable"/>'
+    if model.opt.noslip_iterations:
+        yield "noslip_iterations", "remove it"
+    if stops_early(model):
+        few = f"where C stops after so few iterations ({model.opt.iterations}), with "
+        if model.opt.solver == _C.mjtSolver.mjSOL_CG:
+            yield few + "conjugate gradients", _GO_ON
+        if model.opt.cone == _C.mjtCone.mjCONE_ELLIPTIC and any(geom_pairs(model)):
+            yield few + "elliptic cones", _GO_ON
+    if model.opt.disableactuator:
+        yield "disabled groups of actuators", "remove actuatorgroupdisable, or those actuators"
+    for flag, values in (("spring", "stiffness"), ("damper", "damping")):
+        if is_off(model, flag):
+            yield f'parts of <flag {flag}="disable"/>', f"remove it, and give no {values}"
+    for flag in ("nativeccd", "multiccd"):
+        if is_off(model, flag):
+            yield f'<flag {flag}="disable"/>', "remove it"
+    if model.opt.integrator == _C.mjtIntegrator.mjINT_DISCRETE:
+        yield "the integrator INT_DISCRETE", _REMEDIES["mjINT_"]
+
+
+def _missing(model: MjModel) -> Iterator[tuple[str, str]]:
+    """Yields what MJX has not, and how to do without it."""
+    values = [(getattr(model, field), *kinds) for field, *kinds in _KINDS]
+    values += [([getattr(model.opt, field)], *kinds) for field, *kinds in _OPTIONS]
+    flags = [1 << bit for bit in range(_ENABLED.mjNENABLE) if model.opt.enableflags & 1 << bit]
+    for present, known, names in (*values, (flags, mjx.EnableBit, _ENABLED)):
+        for kind in sorted({*map(int, present)} - {*map(int, known)}):
+            name = names(kind).name
+            remedy = next((x for part, x in _REMEDIES.items() if part in name), _ELSE)
+            # MJX would ignore the discrete integrator, which _ignored says.
+            if name != "mjINT_DISCRETE":
+                yield f"MJX has no {name}", remedy
+    if model.nu and not model.nv:
+        yield "nothing in it moves, and MJX needs a joint", "add a <joint>"
+    if model.nflex:
+        yield "MJX has no flexible bodies", "remove the <flexcomp> or <flex>"
+    fluid = model.opt.density or model.opt.viscosity or model.opt.wind.any()
+    if fluid and model.opt.integrator == _C.mjtIntegrator.mjINT_IMPLICITFAST:
+        remedy = 'set <option integrator="Euler"/> or remove density, viscosity and wind'
+        yield "MJX has no fluid drag with the integrator implicitfast", remedy
+    if _C.mjtSensor.mjSENS_RANGEFINDER in model.sensor_type and not model.nmat:
+        remedy = 'add <asset><material name="any"/></asset>'
+        yield "its rangefinders work only with a material, a bug of MJX", remedy
+    of_contacts = model.sensor_type == _C.mjtSensor.mjSENS_CONTACT
+    ends = np.stack([model.sensor_objtype, model.sensor_reftype])[:, of_contacts]
+    wide = np.isin(ends, (_C.mjtObj.mjOBJ_SITE, _C.mjtObj.mjOBJ_BODY, _C.mjtObj.mjOBJ_XBODY))
+    if wide.any() or np.any(model.sensor_intprm[of_contacts, 1] == 3):
+        remedy = "name two geoms, and do not reduce to the net force"
+        yield "MJX has contact sensors between geoms alone, without net force", remedy
+
+
+def _of_contacts(model: MjModel) -> Iterator[tuple[str, str]]:
+    """Yields which contacts MJX has not, or finds elsewhere, and how to do without them."""
+    groups: dict[tuple[str, str], list[tuple[int, int]]] = {}
+    for first, second, pair in geom_pairs(model):
+        geoms = [int(first), int(second)]
+        kinds = (int(model.geom_type[first]), int(model.geom_type[second]))
+        margin = model.geom_margin[geoms].sum() if pair < 0 else model.pair_margin[pair]
+        for reason in _unlike(kinds, margin):
+            groups.setdefault(reason, []).append((geoms[0], geoms[1]))
+    for (reason, remedy), pairs in groups.items():
+        said = f"{len(pairs):,} pair{'s' * (len(pairs) > 1)} of {reason}"
+        pair_names = [" and ".join(geom_name(model, geom) for geom in pair) for pair in pairs]
+        yield f"{said} ({_listed(pair_names)})", remedy.format(exclude=_exclude(model, pairs))
+    if model.opt.cone == _C.mjtCone.mjCONE_ELLIPTIC:
+        alone = [pair for condim, *pair in geom_groups(model) if condim == 1]
+        if alone:
+            names = _listed([" and ".join(geom_name(model, geom) for geom in x) for x in alone])
+            said = f"MJX has no contacts of condim 1 in elliptic cones: {len(alone)} ({names})"
+            yield said, 'set <option cone="pyramidal"/> or condim="3"'
+
+
+def _unlike(kinds: tuple[int, int], margin: float) -> Iterator[tuple[str, str]]:
+    """Yields why contacts of geoms of two kinds would be others than C's, and a remedy."""
+    names = " on ".join(_GEOM(kind).name[len("mjGEOM_") :].lower() for kind in reversed(kinds))
+    apart = "keep those apart with contype and conaffinity{exclude}, or use "
+    if _GEOM.mjGEOM_SDF in kinds or not has_collider(*kinds):
+        yield f"{names}, which MJX has not", f"{apart}spheres, capsules, boxes and planes"
+    elif kinds in UNLIKE_C:
+        yield f"{names}, {UNLIKE_C[kinds]}", f"{apart}spheres, capsules, boxes and planes"
+    elif margin and kinds in UNLIKE_C_WITHIN_MARGIN:
+        remedy = "remove margin and gap from those geoms"
+        yield f"{names} with a margin or gap, which MJX ignores", remedy
+
+
+def _exclude(model: MjModel, pairs: Sequence[tuple[int, int]]) -> str:
+    """Returns what to write to keep the bodies of the first pair apart, if both have names."""
+    names = [model.body(int(model.geom_bodyid[geom])).name for geom in pairs[0]]
+    if not all(names):
+        return ""
+    return ', or with <contact><exclude body1="{}" body2="{}"/></contact>'.format(*names)
+
+
+def geom_name(model: MjModel, geom: int) -> str:
+    """Returns what a message calls a geom: by its name, or by its body's and its number."""
+    if model.geom(geom).name:
+        return model.geom(geom).name
+    body = int(model.geom_bodyid[geom])
+    where = model.body(body).name or f"number {body}"
+    return f"geom {geom - int(model.body_geomadr[body])} of body {where}"
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Returns the first names, and how many more there are."""
+    more = len(names) - _NAMED
+    return ", ".join(names[:_NAMED]) + (f", and {more:,} more" if more > 0 else "")
