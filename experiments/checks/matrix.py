@@ -42,6 +42,8 @@ FIELDS = (
     *("qpos", "qvel", "act", "qacc", "sensordata", "ten_length", "actuator_length"),
     *("actuator_force", "qfrc_bias", "qfrc_passive", "qfrc_actuator", "qfrc_constraint"),
 )
+#: How XLA compiles what runs once.
+_QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 #: So many mechanisms with contacts are kept apart by the bits of contype.
 BITS = 31
 
@@ -139,7 +141,7 @@ def by_us(model: Any, starts: Start, steps: int) -> list[np.ndarray]:
         data = models.make_data(model).replace(qpos=qpos, qvel=qvel, act=act)
         return lax.scan(step, data, None, steps)[1]
 
-    shown = jax.jit(jax.vmap(play))(starts)
+    shown = jax.jit(jax.vmap(play), compiler_options=_QUICK)(starts)
     return [np.asarray(x).reshape(*x.shape[:2], -1) for x in shown]
 
 

@@ -35,6 +35,9 @@ MODELS = {
     for name, parts in group.items()
 }
 
+#: The joints that a sensor of actuator forces may be at.
+_SCALAR = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
+
 #: Positions, velocities, activations, and controls.
 Start: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
@@ -120,6 +123,25 @@ def _clamped(actuator: str, clamp: str, integrator: str) -> str:
         element = element.replace("/>", f" {bounded['actuator']}/>")
     option = f'integrator="{integrator}"'
     return _mjcf("pendulum", **bounded | {"actuator": element, "option": option})
+
+
+def _sensed(xml: str, attributes: str) -> str:
+    """Returns a mechanism with every kind of sensor at everything in it that has a name."""
+    spec = mujoco.MjSpec.from_string(xml)
+    moving = [body for body in spec.bodies if body.name not in ("", "world")]
+    joints = [joint for joint in spec.joints if joint.type in _SCALAR]
+    parts = {
+        "site": [site for site in spec.sites if site.parent in moving],
+        "geom": [geom for geom in spec.geoms if geom.name],
+        **{"body": moving, "xbody": moving, "joint": joints, "camera": spec.cameras},
+        **{"tendon": spec.tendons, "actuator": spec.actuators},
+    }
+    sensors = ""
+    for place, kinds in _TABLES["sensors"].items():
+        for (kind, key), part in itertools.product(kinds.items(), parts[place]):
+            of = f'objtype="{place}" objname' if key == "obj" else key
+            sensors += f'<{kind} {of}="{part.name}" {attributes}/>'
+    return xml.replace("</sensor>", f"{sensors}</sensor>")
 
 
 def mechanisms() -> Iterator[Mechanism]:

@@ -40,7 +40,7 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
-from mjx_reinforce.engine.physics import contacts, inertia, limits, newton, touching
+from mjx_reinforce.engine.physics import contacts, inertia, limits, newton, sensors, touching
 from mjx_reinforce.engine.physics.mjx_internals import advance, jax_fields, with_fields
 
 # For each stage: its place in the timestep, its weight, and the place of the next stage.
@@ -92,8 +92,8 @@ def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = mjx.fwd_actuation(model, data)
     data = inertia.fwd_acceleration(model, data)
     if jax_fields(data).efc_J.size == 0:
-        return mjx.sensor_acc(model, data.replace(qacc=data.qacc_smooth))
-    return mjx.sensor_acc(model, solve_constraints(model, data))
+        return sensors.sensor_acc(model, data.replace(qacc=data.qacc_smooth))
+    return sensors.sensor_acc(model, solve_constraints(model, data))
 
 
 def solve_constraints(model: mjx.Model, data: mjx.Data) -> mjx.Data:
