@@ -1,0 +1,72 @@
+"""Forces on bodies, and the sensors of forces and accelerations, as in C MuJoCo 4.0.
+
+MJX leaves out the forces of spatial tendons (``tendons``), counts the rows of equalities and
+contacts whose flags are disabled, though nothing has made them, and fails where a sensor asks for
+contacts that cannot be.
+"""
+
+from typing import Any, TypeAlias
+
+import jax
+import numpy as np
+from mujoco import mjx
+
+from mjx_reinforce.engine.physics import tendons
+from mjx_reinforce.engine.physics.mjx_internals import jax_fields, with_contact, with_fields
+
+_NO_EQUALITY = mjx.DisableBit.EQUALITY | mjx.DisableBit.CONSTRAINT
+_NO_CONTACT = mjx.DisableBit.CONTACT | mjx.DisableBit.CONSTRAINT
+_OF_CONTACTS = mjx.SensorType.TOUCH, mjx.SensorType.CONTACT
+#: A type that no sensor has.
+_NO_TYPE = -1
+_FOR_SENSORS = "cacc", "cfrc_int", "cfrc_ext", "subtree_linvel", "subtree_angmom"
+#: What is computed only for sensors.
+Shown: TypeAlias = dict[str, Any]
+
+
+def rne_postconstraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Computes cfrc_ext, cfrc_int and cacc, as ``mj_rnePostConstraint``."""
+    return _like(mjx.rne_postconstraint(*_counted(model, data)), data)
+
+
+def sensor_acc(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Computes the sensors of forces and accelerations, as ``mj_sensorAcc``."""
+    counted, shown = _counted(model, data)
+    if not jax_fields(shown).contact.dim.size:
+        kinds = np.where(np.isin(model.sensor_type, _OF_CONTACTS), _NO_TYPE, model.sensor_type)
+        counted = counted.replace(sensor_type=kinds)
+    return _like(mjx.sensor_acc(counted, shown), data)
+
+
+def shown(model: mjx.Model, data: mjx.Data) -> Shown:
+    """Returns what is computed only for sensors; nothing if the model has none."""
+    if not model.nsensor:
+        return {}
+    fields = {name: getattr(jax_fields(data), name) for name in _FOR_SENSORS}
+    return {"sensordata": data.sensordata, "fields": fields}
+
+
+def with_shown(data: mjx.Data, sensed: Shown) -> mjx.Data:
+    """Returns the data with what ``shown`` returned."""
+    if not sensed:
+        return data
+    return with_fields(data.replace(sensordata=sensed["sensordata"]), **sensed["fields"])
+
+
+def _like(computed: mjx.Data, data: mjx.Data) -> mjx.Data:
+    """Returns what was computed, with the contacts and the forces that the data had."""
+    contact = jax_fields(data).contact
+    return with_contact(computed.replace(xfrc_applied=data.xfrc_applied), contact, contact.dim)
+
+
+def _counted(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Model, mjx.Data]:
+    """Returns what MJX counts forces right of: what exists, and tendons among applied forces."""
+    if model.opt.disableflags & _NO_EQUALITY:
+        model = model.replace(eq_type=np.full_like(model.eq_type, _NO_TYPE))
+    if model.opt.disableflags & _NO_CONTACT:
+        none = jax.tree.map(lambda x: x[:0], jax_fields(data).contact)
+        data = with_contact(data, none, none.dim[:0])
+    if np.isin(mjx.WrapType.SITE, model.wrap_type):
+        applied = data.xfrc_applied + tendons.body_forces(model, data)
+        data = data.replace(xfrc_applied=applied)
+    return model, data
