@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from mujoco import mjx, mjMINVAL  # pyright: ignore[reportAttributeAccessIssue] (a C extension)
+from mujoco import mjMINVAL, mjx  # pyright: ignore[reportAttributeAccessIssue] (a C extension)
 
 from mjx_reinforce.engine.physics import mjx_internals
 from mjx_reinforce.engine.physics.mjx_internals import jax_fields
@@ -88,7 +88,7 @@ def _pieces(model: mjx.Model, data: mjx.Data) -> list[_Ends]:
 
 
 def _forces(model: mjx.Model, data: mjx.Data) -> jax.Array:
-    """Returns the force of each tendon along its length, [ntendon] (N): where positive, it pushes."""
+    """Returns the force of each tendon along its length, [ntendon] (N); if positive, it pushes."""
     fields = jax_fields(data)
     below, above = model.tendon_lengthspring.T - data.ten_length
     force = model.tendon_stiffness * (jnp.maximum(below, 0) + jnp.minimum(above, 0))
