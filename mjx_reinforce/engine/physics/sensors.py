@@ -1,13 +1,14 @@
 """Forces on bodies, and the sensors of forces and accelerations, as in C MuJoCo 4.0.
 
-MJX leaves out the forces of spatial tendons (``tendons``), counts the rows of equalities and
-contacts whose flags are disabled, though nothing has made them, and fails where a sensor asks for
-contacts that cannot be.
+MJX leaves out the forces of spatial tendons (``tendons``) and the cutoff of a frame's acceleration,
+counts the rows of equalities and contacts whose flags are disabled, though nothing has made them,
+and fails where a sensor asks for contacts that cannot be.
 """
 
 from typing import Any, TypeAlias
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
@@ -17,6 +18,7 @@ from mjx_reinforce.engine.physics.mjx_internals import jax_fields, with_contact,
 _NO_EQUALITY = mjx.DisableBit.EQUALITY | mjx.DisableBit.CONSTRAINT
 _NO_CONTACT = mjx.DisableBit.CONTACT | mjx.DisableBit.CONSTRAINT
 _OF_CONTACTS = mjx.SensorType.TOUCH, mjx.SensorType.CONTACT
+_OF_FRAMES = mjx.SensorType.FRAMELINACC, mjx.SensorType.FRAMEANGACC
 #: A type that no sensor has.
 _NO_TYPE = -1
 _FOR_SENSORS = "cacc", "cfrc_int", "cfrc_ext", "subtree_linvel", "subtree_angmom"
@@ -31,11 +33,20 @@ def rne_postconstraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 def sensor_acc(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Computes the sensors of forces and accelerations, as ``mj_sensorAcc``."""
-    counted, shown = _counted(model, data)
-    if not jax_fields(shown).contact.dim.size:
+    counted, rows = _counted(model, data)
+    if not jax_fields(rows).contact.dim.size:
         kinds = np.where(np.isin(model.sensor_type, _OF_CONTACTS), _NO_TYPE, model.sensor_type)
         counted = counted.replace(sensor_type=kinds)
-    return _like(mjx.sensor_acc(counted, shown), data)
+    return _like(_cut(model, mjx.sensor_acc(counted, rows)), data)
+
+
+def _cut(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Returns the data with the accelerations of frames within their cutoffs."""
+    cut = np.isin(model.sensor_type, _OF_FRAMES) & (model.sensor_cutoff > 0)
+    if not cut.any():
+        return data
+    cutoff = np.repeat(np.where(cut, model.sensor_cutoff, np.inf), model.sensor_dim)
+    return data.replace(sensordata=jnp.clip(data.sensordata, -cutoff, cutoff))
 
 
 def shown(model: mjx.Model, data: mjx.Data) -> Shown:
