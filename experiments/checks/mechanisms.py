@@ -17,6 +17,7 @@ mujoco: Any = importlib.import_module("mujoco")  # pyright does not know what is
 
 _TABLES: dict[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
 _LISTS = _TABLES["lists"]
+_FAILURES = tomllib.loads(Path(__file__).with_name("failures.toml").read_text("utf-8"))["failures"]
 
 
 def _mjcf(template: str, **parts: str) -> str:
@@ -201,3 +202,9 @@ def mechanisms() -> Iterator[Mechanism]:
         friction = f'condim="{condim}" friction="1 .02 .01" priority="1"'
         xml = _mjcf("scene", geom=f"{_TABLES['touching'][geom]} {friction}", option=option)
         yield Mechanism("cones", option, f"{geom}, condim {condim}", xml, _moving)
+
+
+def failures() -> list[Mechanism]:
+    """Returns all that ever differed from C, as ``failures.toml`` lists them."""
+    known = {each.title: each for each in mechanisms()}
+    return [known[row["axis"], row["option"], name] for row in _FAILURES for name in row["names"]]
