@@ -19,6 +19,11 @@ _NO_EQUALITY = mjx.DisableBit.EQUALITY | mjx.DisableBit.CONSTRAINT
 _NO_CONTACT = mjx.DisableBit.CONTACT | mjx.DisableBit.CONSTRAINT
 _OF_CONTACTS = mjx.SensorType.TOUCH, mjx.SensorType.CONTACT
 _OF_FRAMES = mjx.SensorType.FRAMELINACC, mjx.SensorType.FRAMEANGACC
+#: What shows forces on bodies, or what follows from them.
+_OF_BODIES = (
+    *(mjx.SensorType.ACCELEROMETER, mjx.SensorType.FORCE, mjx.SensorType.TORQUE),
+    *_OF_FRAMES,
+)
 #: A type that no sensor has.
 _NO_TYPE = -1
 _FOR_SENSORS = "cacc", "cfrc_int", "cfrc_ext", "subtree_linvel", "subtree_angmom"
@@ -28,16 +33,19 @@ Shown: TypeAlias = dict[str, Any]
 
 def rne_postconstraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Computes cfrc_ext, cfrc_int and cacc, as ``mj_rnePostConstraint``."""
-    return _like(mjx.rne_postconstraint(*_counted(model, data)), data)
+    model, counted = _existing(model, data)
+    return _like(mjx.rne_postconstraint(model, _with_tendons(model, counted)), data)
 
 
 def sensor_acc(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Computes the sensors of forces and accelerations, as ``mj_sensorAcc``."""
-    counted, rows = _counted(model, data)
-    if not jax_fields(rows).contact.dim.size:
+    model, counted = _existing(model, data)
+    if np.isin(model.sensor_type, _OF_BODIES).any():
+        counted = _with_tendons(model, counted)
+    if not jax_fields(counted).contact.dim.size:
         kinds = np.where(np.isin(model.sensor_type, _OF_CONTACTS), _NO_TYPE, model.sensor_type)
-        counted = counted.replace(sensor_type=kinds)
-    return _like(_cut(model, mjx.sensor_acc(counted, rows)), data)
+        model = model.replace(sensor_type=kinds)
+    return _like(_cut(model, mjx.sensor_acc(model, counted)), data)
 
 
 def _cut(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -70,14 +78,18 @@ def _like(computed: mjx.Data, data: mjx.Data) -> mjx.Data:
     return with_contact(computed.replace(xfrc_applied=data.xfrc_applied), contact, contact.dim)
 
 
-def _counted(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Model, mjx.Data]:
-    """Returns what MJX counts forces right of: what exists, and tendons among applied forces."""
+def _existing(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Model, mjx.Data]:
+    """Returns the model and data without the equalities and contacts whose flags are disabled."""
     if model.opt.disableflags & _NO_EQUALITY:
         model = model.replace(eq_type=np.full_like(model.eq_type, _NO_TYPE))
     if model.opt.disableflags & _NO_CONTACT:
         none = jax.tree.map(lambda x: x[:0], jax_fields(data).contact)
         data = with_contact(data, none, none.dim[:0])
-    if np.isin(mjx.WrapType.SITE, model.wrap_type):
-        applied = data.xfrc_applied + tendons.body_forces(model, data)
-        data = data.replace(xfrc_applied=applied)
     return model, data
+
+
+def _with_tendons(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Returns the data with the forces of spatial tendons among those that are applied to bodies."""
+    if not np.isin(mjx.WrapType.SITE, model.wrap_type):
+        return data
+    return data.replace(xfrc_applied=data.xfrc_applied + tendons.body_forces(model, data))

@@ -46,7 +46,7 @@ ARM = """
   <equality>{equality}</equality>
   <sensor>
     <force site="middle"/><torque site="middle"/><force site="tip"/><torque site="tip"/>
-    <force site="weight"/><accelerometer site="tip"/><touch site="tip"/>{sensor}
+    <force site="weight"/><accelerometer site="tip"/>{sensor}
   </sensor>
 </mujoco>
 """
@@ -74,6 +74,7 @@ HELD = {
     '<weld body1="lower" body2="world"/>',
     "lower": 'contype="1"',
     "world": '<geom type="plane" size="5 5 1" conaffinity="1" pos="0 0 .98"/>',
+    "sensor": '<touch site="tip"/>',
 }
 FLAGS = "equality", "contact", "constraint"
 CASES |= {
@@ -89,7 +90,9 @@ CASES |= {
     },
     "Runge-Kutta": {"option": 'integrator="RK4"'},
     **{f"no {flag}": HELD | {"flags": f'<flag {flag}="disable"/>'} for flag in FLAGS},
-    "no contacts": {"sensor": '<contact geom1="lower" num="2" data="found force"/>'},
+    "no contacts": {
+        "sensor": '<touch site="tip"/><contact geom1="lower" num="2" data="found force"/>'
+    },
     "cutoff": {"sensor": '<framelinacc objtype="site" objname="tip" cutoff=".5"/>'},
 }
 
