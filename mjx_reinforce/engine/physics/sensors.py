@@ -89,7 +89,7 @@ def _existing(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Model, mjx.Data]:
 
 
 def _with_tendons(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Returns the data with the forces of spatial tendons among those that are applied to bodies."""
+    """Returns the data with the forces of spatial tendons among the forces applied to bodies."""
     if not np.isin(mjx.WrapType.SITE, model.wrap_type):
         return data
     return data.replace(xfrc_applied=data.xfrc_applied + tendons.body_forces(model, data))
