@@ -16,7 +16,7 @@ from mujoco import mjMAXVAL, mjx  # pyright: ignore[reportAttributeAccessIssue] 
 from mjx_reinforce.engine.base import Box, MjModel, is_kept_whole, observation_size
 from mjx_reinforce.engine.checks import changed_fields, check_count, check_number
 from mjx_reinforce.engine.contract import check_shape
-from mjx_reinforce.engine.physics import mjx_internals
+from mjx_reinforce.engine.physics import mjx_internals, sensors
 from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
 from mjx_reinforce.engine.scalar import prune, whole
@@ -261,7 +261,7 @@ class MujocoEnv(Env):
             data, sound = jax.lax.fori_loop(0, self.frame_skip, advance, start_of_loop)
             if self.contact_forces:
                 model = self.model.replace(**models.replaced(self.mj_model, before.episode))
-                data = mjx.rne_postconstraint(model, data)
+                data = sensors.rne_postconstraint(model, data)
         view = View(data, self.mj_model, before.episode)
         reward, terminated, terms = self._outcome(before, start, view, action)
         dtype = state.reward.dtype

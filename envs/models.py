@@ -14,7 +14,7 @@ from mujoco import MjModel, MjSpec, mjx  # pyright: ignore[reportAttributeAccess
 
 from mjx_reinforce.engine.checks import BadEnvironmentError, explain
 from mjx_reinforce.engine.physics import contacts
-from mjx_reinforce.envs.refusals import check_meshes, check_supported, is_off, may_touch
+from mjx_reinforce.envs.refusals import check_meshes, check_supported, is_off
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco
@@ -32,10 +32,6 @@ RANDOM = (
 _ONLY_REPORTS = int(_C.mjtEnableBit.mjENBL_ENERGY | _C.mjtEnableBit.mjENBL_FWDINV)
 #: Elements of <custom> that MJX reads, by which it drops contacts. To C they are the user's own.
 _READ_BY_MJX = ("max_contact_points", "max_geom_pairs")
-#: Equalities whose forces on bodies MJX adds up.
-_HOLDS = (int(_C.mjtEq.mjEQ_CONNECT), int(_C.mjtEq.mjEQ_WELD))
-#: Sensors of contacts.
-_FEELS = (int(_C.mjtSensor.mjSENS_TOUCH), int(_C.mjtSensor.mjSENS_CONTACT))
 #: What MuJoCo calls a model without a name.
 _NAMELESS = "MuJoCo Model"
 #: The name of a file, an ``MjSpec`` or an ``MjModel``, which MuJoCo does not declare.
@@ -165,21 +161,4 @@ def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
     except Exception as error:  # of another library: no refusal
         raise BadEnvironmentError(f"converting {name} to MJX fails: {explain(error)}") from error
     check_meshes(converted, model, name)
-    return _without_rows(converted, model)
-
-
-def _without_rows(converted: mjx.Model, model: MjModel) -> mjx.Model:
-    """Returns the model without what MJX reads from constraint rows that are not there.
-
-    A sensor of contacts is 0 in C where nothing can touch, and so is that of a kind which MJX does
-    not compute. Equalities that a flag disables have no forces.
-    """
-    if not may_touch(model):
-        feels = np.isin(model.sensor_type, _FEELS)
-        sensors = np.where(feels, int(_C.mjtSensor.mjSENS_USER), model.sensor_type)
-        converted = converted.replace(sensor_type=sensors)
-    if is_off(model, "equality") or is_off(model, "constraint"):
-        holds = np.isin(model.eq_type, _HOLDS)
-        kinds = np.where(holds, int(_C.mjtEq.mjEQ_JOINT), model.eq_type)
-        converted = converted.replace(eq_type=kinds)
     return converted

@@ -4,17 +4,21 @@ Compiling is the cost: mechanisms with the same options are bodies of one model 
 one another, and their starts are a batch. C simulates each alone, and its solver goes on to the
 optimum; on the axis of few iterations C simulates all together, with the options of the file. The
 error of a cell (a mechanism from one start) is the largest of what MuJoCo computes, in double
-precision: relative where a number is greater than one. What is not simulated is refused, in words.
+precision: relative where a number is greater than one. Of the axis ``forces``, each kind of sensor
+is a cell. What is not simulated is refused, in words of ours; any other error ends the program.
 """
 
 import csv
 import dataclasses
 import functools
 import importlib
+import random
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from itertools import groupby
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,9 +28,11 @@ import numpy as np
 import tyro
 from jax import lax
 
-from experiments.checks.mechanisms import MOTOR, Mechanism, Start, mechanisms
+from experiments.checks.mechanisms import FORCES, MOTOR, Mechanism, Start, failures, mechanisms
 from mjx_reinforce import normal
 from mjx_reinforce.engine.physics import step as physics
+from mjx_reinforce.engine.physics.mjx_internals import Simulation
+from mjx_reinforce.engine.physics.sensors import rne_postconstraint
 from mjx_reinforce.engine.play import native
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import MujocoEnv
@@ -37,12 +43,17 @@ mujoco: Any = importlib.import_module("mujoco")  # pyright does not know what is
 #: What counts as equal.
 EQUAL = 1e-9
 #: What is compared; of bodies, all but the world.
-BODIES = ("xpos", "xquat", "subtree_com", "cvel")
+BODIES = ("xpos", "xquat", "subtree_com", "cvel", "cacc", "cfrc_ext", "cfrc_int")
 FIELDS = (
     *BODIES,
     *("qpos", "qvel", "act", "qacc", "sensordata", "ten_length", "actuator_length"),
     *("actuator_force", "qfrc_bias", "qfrc_passive", "qfrc_actuator", "qfrc_constraint"),
 )
+#: How XLA compiles what runs once.
+_QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+#: The lot by which CI's part of the matrix is drawn, and so many mechanisms of a program.
+_SEED = 62
+_SAMPLED = 10
 #: So many mechanisms with contacts are kept apart by the bits of contype.
 BITS = 31
 
@@ -53,8 +64,12 @@ class Settings:
 
     native: bool = False
     """Simulate each mechanism alone, by machine code, from its first start."""
+    sample: bool = False
+    """Simulate the part that CI does: all that ever failed, and others by lot."""
+    jobs: int = 1
+    """Programs at a time, each in a process of its own."""
     only: tuple[str, ...] = ()
-    """Axes or names of mechanisms, by default all."""
+    """Axes, options or names of mechanisms, by default all."""
     output: Path = Path("docs/own_models.csv")
     """A row for each mechanism under each option: the worst start, or the refusal."""
 
@@ -79,6 +94,8 @@ class Cell(NamedTuple):
 
 class Shown(MujocoEnv):
     """A model that shows what MuJoCo computes, from a start on, forever."""
+
+    contact_forces = True
 
     def __init__(self, model: Any, start: Start, steps: int):
         """Takes a model, and where it starts."""
@@ -126,6 +143,7 @@ def by_c_as_is(model: Any, start: Start, steps: int) -> list[np.ndarray]:
     for _ in range(steps):
         data.ctrl[:] = control(ctrl, data.time)
         mujoco.mj_step(model, data)
+        mujoco.mj_rnePostConstraint(model, data)
         shown.append([x.flatten() for x in fields(data)])
     return [np.stack(field) for field in zip(*shown, strict=True)]
 
@@ -139,13 +157,13 @@ def by_us(model: Any, starts: Start, steps: int) -> list[np.ndarray]:
         def step(data: Any, _: None) -> tuple[Any, list[jax.Array]]:
             given = data.replace(ctrl=control(ctrl, data.time, jnp))
             data = physics.like(physics.step(in_mjx, given, forward), data)
-            return data, fields(data)
+            return data, fields(Simulation(rne_postconstraint(in_mjx, data)))
 
         qpos, qvel, act, ctrl = start
         data = models.make_data(model).replace(qpos=qpos, qvel=qvel, act=act)
         return lax.scan(step, data, None, steps)[1]
 
-    shown = jax.jit(jax.vmap(play))(starts)
+    shown = jax.jit(jax.vmap(play), compiler_options=_QUICK)(starts)
     return [np.asarray(x).reshape(*x.shape[:2], -1) for x in shown]
 
 
@@ -171,7 +189,7 @@ def by_machine_code(model: Any, start: Start, steps: int) -> list[np.ndarray]:
 
 
 def load(parts: Sequence[Mechanism]) -> Any:
-    """Returns one model of mechanisms that do not touch; UnsupportedError is a refusal of ours."""
+    """Returns one model of mechanisms that do not touch."""
     spec = mujoco.MjSpec.from_string(f"<mujoco>{parts[-1].option}</mujoco>")
     contacts = 0
     for i, each in enumerate(parts):
@@ -181,21 +199,19 @@ def load(parts: Sequence[Mechanism]) -> Any:
             geom.contype = geom.conaffinity = 1 << contacts
         contacts += bool(geoms)
         spec.attach(child, prefix=f"{i}/", frame=spec.worldbody.add_frame())
-    model = models.load_model(spec)
-    models.to_mjx(model, "it")
-    return model
+    return models.load_model(spec)
 
 
-def refusal(parts: Sequence[Mechanism]) -> str:
-    """Returns why ``make`` refuses some mechanisms, or nothing."""
+def refusal(model: Any) -> str:
+    """Returns why ``make`` refuses a model, or nothing; raises errors that are not ours."""
     try:
-        load(parts)
+        models.to_mjx(model, "it")
     except UnsupportedError as error:  # any other is a mistake, and ends this program
         return str(error)
     return ""
 
 
-def programs(chosen: Sequence[Mechanism]) -> Iterator[list[Mechanism]]:
+def programs(chosen: Iterable[Mechanism]) -> Iterator[list[Mechanism]]:
     """Yields mechanisms that one model has: of one axis and one option."""
     groups: dict[Any, list[Mechanism]] = {}
     for each in chosen:
@@ -203,6 +219,23 @@ def programs(chosen: Sequence[Mechanism]) -> Iterator[list[Mechanism]]:
     for group in groups.values():
         size = len(group) if group[0].axis == "actuators" else BITS
         yield from (group[i : i + size] for i in range(0, len(group), size))
+
+
+def sample() -> list[list[Mechanism]]:
+    """Returns programs that take two cores at most four minutes: always the same ones.
+
+    They are all that ever failed, and mechanisms by lot of one program of each axis, in which the
+    axis ``forces`` counts twice.
+    """
+    lot, axes = random.Random(_SEED), {}
+    for together in programs(mechanisms()):
+        axes.setdefault(together[0].axis, []).append(together)
+    few = []
+    for axis, of_axis in axes.items():
+        count, sizes = 2 if axis == "forces" else 1, [len(together) for together in of_axis]
+        for together in lot.sample(of_axis, count, counts=sizes):
+            few += lot.sample(together, min(len(together), _SAMPLED))
+    return list(programs(list(dict.fromkeys((*failures(), *few)))))
 
 
 def compare(together: Sequence[Mechanism], native: bool = False) -> Iterator[Cell]:
@@ -213,10 +246,9 @@ def compare(together: Sequence[Mechanism], native: bool = False) -> Iterator[Cel
         "", "", "", MOTOR, lambda _: dict.fromkeys(together[0].starts, rest), together[0].steps
     )
     parts = [motor, *together]
-    try:
-        model = load(parts)
-    except UnsupportedError:
-        refused = {each: words for each in together if (words := refusal([motor, each]))}
+    model = load(parts)
+    if refusal(model):
+        refused = {each: words for each in together if (words := refusal(load([motor, each])))}
         for each, words in refused.items():
             yield from (Cell(*each.title, start, np.nan, words) for start in each.starts)
         if left := [each for each in together if each not in refused]:
@@ -238,16 +270,36 @@ def compare(together: Sequence[Mechanism], native: bool = False) -> Iterator[Cel
             sizes = [field.shape[1] for field in theirs]
             if as_is:
                 theirs = [x[:, :n] for x, n in zip(stopped[k], sizes, strict=True)]
-            errors = [
-                np.max(np.abs(x[:, :n] - y) / np.maximum(1, np.abs(y)), initial=0.0)
-                for x, y, n in zip(ours, theirs, sizes, strict=True)
-            ]
-            worst = int(np.argmax(np.nan_to_num(errors, nan=np.inf)))
             if each is not motor:
-                error = float(np.nan_to_num(errors[worst], nan=np.inf))
-                yield Cell(*each.title, name, error, FIELDS[worst])
+                errors = [
+                    np.max(np.abs(x[:, :n] - y) / np.maximum(1, np.abs(y)), axis=0)
+                    for x, y, n in zip(ours, theirs, sizes, strict=True)
+                ]
+                yield from cells(each, name, errors)
         shown = [x[..., n:] for x, n in zip(shown, sizes, strict=True)]
         stopped = [[x[:, n:] for x, n in zip(c, sizes, strict=True)] for c in stopped]
+
+
+def cells(each: Mechanism, start: str, errors: Sequence[np.ndarray]) -> Iterator[Cell]:
+    """Yields the cells of a mechanism from a start, given the errors of each field's numbers."""
+    names = np.repeat(FIELDS, [len(x) for x in errors])
+    names[names == "sensordata"] = each.readings
+    error = np.nan_to_num(np.concatenate(errors), nan=np.inf)
+    if each.axis != "forces":
+        readings = {"": error >= 0}
+    else:
+        readings = {name: chosen for name in FORCES if np.any(chosen := names == name)}
+        readings["motion"] = ~np.isin(names, FORCES)
+    for reading, chosen in readings.items():
+        worst = np.argmax(error[chosen])
+        yield Cell(
+            *each.title, named(start, reading), float(error[chosen][worst]), names[chosen][worst]
+        )
+
+
+def named(start: str, reading: str) -> str:
+    """Returns what a cell is called after: its start, and what is read if not all is."""
+    return f"{start}, {reading}" if reading else start
 
 
 def summarized(cells: Sequence[Cell]) -> Iterator[tuple[Any, ...]]:
@@ -259,26 +311,45 @@ def summarized(cells: Sequence[Cell]) -> Iterator[tuple[Any, ...]]:
         yield *title, len(starts), worst.start, f"{worst.error:.1e}", worst.words
 
 
+def played(settings: Settings, number: int) -> tuple[list[Cell], float]:
+    """Returns the cells of a program of those chosen, and the seconds of processor time."""
+    jax.config.update("jax_enable_x64", True)
+    began = time.process_time()
+    together = chosen(settings)[number]
+    parts = [[each] for each in together] if settings.native else [together]
+    shown = [cell for part in parts for cell in compare(part, settings.native)]
+    return shown, time.process_time() - began
+
+
+def chosen(settings: Settings) -> list[list[Mechanism]]:
+    """Returns the programs that are asked for."""
+    if settings.sample:
+        return sample()
+    wanted = set(settings.only)
+    return list(
+        programs([x for x in mechanisms() if not wanted or wanted & {x.axis, x.case, x.name}])
+    )
+
+
 def main(settings: Settings) -> None:
     """Prints the counts of each program and the cells that differ, and writes all."""
-    jax.config.update("jax_enable_x64", True)
-    wanted = set(settings.only)
-    chosen = [each for each in mechanisms() if not wanted or wanted & {each.axis, each.name}]
-    cells: list[Cell] = []
-    for together in programs(chosen):
-        began = time.process_time()
-        parts = [[each] for each in together] if settings.native else [together]
-        found = [cell for part in parts for cell in compare(part, settings.native)]
-        counts, seconds = Counter(cell.verdict for cell in found), time.process_time() - began
-        print(f"{' '.join(together[0].title[:2])}: {dict(counts)}, {seconds:.0f} s", flush=True)
-        for cell in found:
-            if cell.verdict == "differing":
-                print(f"  {cell.mechanism}, {cell.start}: {cell.error:.0e} of {cell.words}")
-        cells += found
-    counts, seconds = Counter(cell.verdict for cell in cells), time.process_time()
-    print(f"{len(cells)} cells: {dict(counts)}; {seconds:.0f} s of CPU")
+    began = time.monotonic()
+    numbers, everything, spent = range(len(chosen(settings))), [], 0.0
+    with ProcessPoolExecutor(settings.jobs, mp_context=get_context("spawn")) as processes:
+        play = functools.partial(played, settings)
+        for shown, seconds in processes.map(play, numbers):
+            counts = Counter(cell.verdict for cell in shown)
+            print(f"{' '.join(shown[0][:2])}: {dict(counts)}, {seconds:.0f} s", flush=True)
+            for cell in shown:
+                if cell.verdict == "differing":
+                    print(f"  {cell.mechanism}, {cell.start}: {cell.error:.0e} of {cell.words}")
+            everything += shown
+            spent += seconds
+    counts = Counter(cell.verdict for cell in everything)
+    passed = f"{time.monotonic() - began:.0f} s, {spent:.0f} s of CPU"
+    print(f"{len(everything)} cells: {dict(counts)}; {passed}")
     with settings.output.open("w", encoding="utf-8", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows(summarized(cells))
+        csv.writer(file, lineterminator="\n").writerows(summarized(everything))
 
 
 if __name__ == "__main__":

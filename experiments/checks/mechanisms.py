@@ -15,8 +15,9 @@ import numpy as np
 
 mujoco: Any = importlib.import_module("mujoco")  # pyright does not know what is in it
 
-_TABLES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
+_TABLES: dict[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
 _LISTS = _TABLES["lists"]
+_FAILURES = tomllib.loads(Path(__file__).with_name("failures.toml").read_text("utf-8"))["failures"]
 
 
 def _mjcf(template: str, **parts: str) -> str:
@@ -29,6 +30,8 @@ def _mjcf(template: str, **parts: str) -> str:
 ASSETS = _LISTS["assets"]
 #: What moves beside the mechanisms of a program.
 MOTOR = _mjcf("arm")
+#: Whose cells are a reading each, in the axis ``forces``.
+FORCES = tuple(_LISTS["forces"])
 #: Name -> MJCF.
 MODELS = {
     name: _mjcf(template, **parts)
@@ -36,6 +39,9 @@ MODELS = {
     for group in groups.values()
     for name, parts in group.items()
 }
+
+#: The joints that a sensor of actuator forces may be at.
+_SCALAR = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
 
 #: Positions, velocities, activations, and controls.
 Start: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -61,6 +67,13 @@ class Mechanism:
     def option(self) -> str:
         """The options, as MJCF."""
         return re.findall("<option.*?</option>", self.xml, re.DOTALL)[0]
+
+    @functools.cached_property
+    def readings(self) -> np.ndarray:
+        """What each number of sensordata is a reading of, by MuJoCo's name of the sensor."""
+        model = mujoco.MjModel.from_xml_string(self.xml)
+        kinds = [mujoco.mjtSensor(kind).name.lower()[7:] for kind in model.sensor_type]
+        return np.repeat(np.array(kinds, str), model.sensor_dim)
 
     @property
     def title(self) -> tuple[str, str, str]:
@@ -124,6 +137,46 @@ def _clamped(actuator: str, clamp: str, integrator: str) -> str:
     return _mjcf("pendulum", **bounded | {"actuator": element, "option": option})
 
 
+def _sensed(xml: str) -> str:
+    """Returns a mechanism with every kind of sensor at everything in it that has a name."""
+    spec = mujoco.MjSpec.from_string(xml)
+    moving = [body for body in spec.bodies if body.name not in ("", "world")]
+    joints = [joint for joint in spec.joints if joint.type in _SCALAR]
+    parts = {
+        "site": [site for site in spec.sites if site.parent in moving],
+        "geom": [geom for geom in spec.geoms if geom.name],
+        "body": moving,
+        "xbody": moving,
+        "joint": joints,
+        "camera": spec.cameras,
+        "tendon": spec.tendons,
+        "actuator": spec.actuators,
+    }
+    sensors = ""
+    for place, kinds in _TABLES["sensors"].items():
+        for (kind, key), part in itertools.product(kinds.items(), parts[place]):
+            of = f'objtype="{place}" objname' if key == "obj" else key
+            sensors += f'<{kind} {of}="{part.name}"/>'
+    return xml.replace("</sensor>", f"{sensors}</sensor>")
+
+
+def _disabled(flags: str) -> str:
+    """Returns MJCF that disables flags."""
+    attributes = "".join(f' {flag}="disable"' for flag in flags.split())
+    return f"<flag{attributes}/>"
+
+
+def _forces() -> Iterator[Mechanism]:
+    """Yields trees that forces come through, each with every sensor of them."""
+    features = {k: v for group in _TABLES["forces"].values() for k, v in group.items()}
+    options = {case: {"option": f'integrator="{case}"'} for case in _LISTS["integrators"]}
+    options |= {case: {"flags": _disabled(case)} for case in _LISTS["flags_of_forces"]}
+    for (case, option), (name, parts) in itertools.product(options.items(), features.items()):
+        said = option | parts
+        said["option"] = f"{option.get('option', '')} {parts.get('option', '')}".strip()
+        yield Mechanism("forces", case, name, _sensed(_mjcf("tree", **said)), _pushed, 2)
+
+
 def mechanisms() -> Iterator[Mechanism]:
     """Yields all mechanisms."""
     for name, xml in MODELS.items():
@@ -142,9 +195,9 @@ def mechanisms() -> Iterator[Mechanism]:
                 starts = functools.partial(_posed, poses=_TABLES[poses])
                 yield Mechanism("geoms", case, f"{geom} on {below}", xml, starts)
     for flag, name in itertools.product(_LISTS["flags"], _LISTS["rows"]):
-        disabled = "".join(f' {each}="disable"' for each in flag.split())
-        xml = MODELS[name].replace("<option >", f"<option ><flag{disabled}/>")
+        xml = MODELS[name].replace("<option >", f"<option >{_disabled(flag)}")
         yield Mechanism("flags", flag, name, xml, _pushed)
+    yield from _forces()
     for option, condim, geom in itertools.product(
         _LISTS["cones"], (1, 3, 4, 6), _TABLES["touching"]
     ):
@@ -157,3 +210,9 @@ def mechanisms() -> Iterator[Mechanism]:
         for name, plain in searched.items():
             xml = plain.replace("<option ", f"<option {limits} ")
             yield Mechanism("iterations", limits, name, xml, _pushed, 20)
+
+
+def failures() -> list[Mechanism]:
+    """Returns all that ever differed from C, as ``failures.toml`` lists them."""
+    known = {each.title: each for each in mechanisms()}
+    return [known[row["axis"], row["option"], name] for row in _FAILURES for name in row["names"]]

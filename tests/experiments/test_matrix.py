@@ -13,15 +13,7 @@ from experiments.checks import matrix
 from experiments.checks.mechanisms import mechanisms
 
 ALL = list(mechanisms())
-#: What MJX computes without us, under an option each; flags, cones and pairs of geoms, which
-#: tests/engine/physics compares. ``matrix`` itself has all.
-MJXS = ("CG", "energy", "wind")
-CHOSEN = [
-    each
-    for each in ALL
-    if (each.axis == "features" and each.name not in MJXS) or each.title[1] == "implicitfast"
-]
-PROGRAMS = {" ".join((*each[0].title, str(len(each)))): each for each in matrix.programs(CHOSEN)}
+PROGRAMS = {" ".join((*each[0].title, str(len(each)))): each for each in matrix.sample()}
 
 
 def written():
@@ -46,9 +38,18 @@ def check(cells):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PROGRAMS)
-def test_a_program_is_as_written(name):
+def test_the_sample_is_as_written(name):
     with jax.enable_x64(True):
         check(list(matrix.compare(PROGRAMS[name])))
+
+
+def test_an_error_that_is_not_ours_is_no_refusal(monkeypatch):
+    """It ends the matrix."""
+    [each] = [x for x in ALL if x.title == ("features", "", "filter")]
+    monkeypatch.setattr(matrix.models.mjx, "put_model", lambda *_, **__: int("not ours"))
+    model = matrix.load([each])
+    with pytest.raises(ValueError, match="not ours"):
+        matrix.refusal(model)
 
 
 def test_every_clamp_is_reached_and_is_not():

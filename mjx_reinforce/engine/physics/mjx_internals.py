@@ -26,6 +26,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src import (
@@ -48,7 +49,7 @@ has_collider = collision_driver.has_collision_fn
 make_frame, quat_mul_axis = math.make_frame, math.quat_mul_axis
 kbi = constraint._kbi
 muscle_gain = support.muscle_gain
-solve_m = smooth.solve_m
+solve_m, tendon_dot = smooth.solve_m, smooth.tendon_dot
 Collision = collision_types.Collision
 GeomInfo = collision_types.GeomInfo
 
@@ -96,6 +97,42 @@ def convex_meshes(model: mjx.Model) -> dict[int, Any]:
     """Returns MJX's convex meshes, of those that may touch something, by their numbers."""
     meshes = cast(Any, model)._impl.mesh_convex
     return {number: mesh for number, mesh in enumerate(meshes) if mesh is not None}
+
+
+def has_friction(model: mjx.Model) -> np.ndarray:
+    """Returns which tendons have rows of friction loss, [ntendon]."""
+    return cast(mjx.ModelJAX, model._impl).tendon_hasfrictionloss
+
+
+def wrap_points(
+    model: mjx.Model, data: mjx.Data, elements: np.ndarray
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Returns whether tendons touch geoms, [W], and where they meet and leave them, [W, 3] each.
+
+    Args:
+      model: an MJX model.
+      data: its data after ``mjx.kinematics``.
+      elements: [W] all of ``model.wrap_type`` that are geoms.
+    """
+    of_model: Any = model._impl
+    before, geom, after = model.wrap_objid[elements + np.array([[-1], [0], [1]])]
+    side = np.round(model.wrap_prm[elements]).astype(int)
+    sphere = model.wrap_type[elements] == mjx.WrapType.SPHERE
+    ends = data.site_xpos[before], data.site_xpos[after]
+    geoms = data.geom_xpos[geom], data.geom_xmat[geom], model.geom_size[geom, 0]
+    of_each = *ends, *geoms, data.site_xpos[side], side[:, None] >= 0, sphere
+    search = of_model.wrap_inside_maxiter, of_model.wrap_inside_tolerance
+    order, parts = [], []
+    for inside in (False, True):
+        chosen = np.flatnonzero(of_model.is_wrap_inside == inside)
+        if chosen.size:
+            fixed = inside, *search, of_model.wrap_inside_z_init
+            wrap = jax.vmap(lambda *x, fixed=fixed: support.wrap(*x, *fixed))
+            parts.append(wrap(*(x[chosen] for x in of_each)))
+            order.append(chosen)
+    inverse = np.argsort(np.concatenate(order))
+    length, *points = (jnp.concatenate(x)[inverse] for x in zip(*parts, strict=True))
+    return length.reshape(-1) >= 0, *points
 
 
 _Colliders = dict[tuple[mjx.GeomType, mjx.GeomType], Callable[..., Any]]

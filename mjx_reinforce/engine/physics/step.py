@@ -12,7 +12,8 @@ The stages are MJX's own, in MJX's order, with seven exceptions:
   the turning of free bodies, as C MuJoCo 4.0 does; MJX 3.17 departs from it.
 - ``inertia.tendon_armature`` couples no branches of a tree, as C MuJoCo 4.0 does not.
 - ``inertia`` solves from the leaves of the kinematic tree to its root, where it is written out.
-- ``forward`` computes the sensors of accelerations without constraints too, where MJX skips them.
+- ``forward`` computes the sensors of accelerations without constraints too, where MJX skips them,
+  and ``sensors`` has the forces that MJX leaves out.
 
 Gymnasium runs C MuJoCo, so its answer is the one we want. For a model without such contacts,
 joints and ``implicitfast``, such as InvertedPendulum's, a step equals ``mjx.step``.
@@ -42,7 +43,15 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
-from mjx_reinforce.engine.physics import contacts, early_stop, inertia, limits, newton, touching
+from mjx_reinforce.engine.physics import (
+    contacts,
+    early_stop,
+    inertia,
+    limits,
+    newton,
+    sensors,
+    touching,
+)
 from mjx_reinforce.engine.physics.mjx_internals import advance, jax_fields, with_fields
 
 # For each stage: its place in the timestep, its weight, and the place of the next stage.
@@ -94,8 +103,8 @@ def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = mjx.fwd_actuation(model, data)
     data = inertia.fwd_acceleration(model, data)
     if jax_fields(data).efc_J.size == 0:
-        return mjx.sensor_acc(model, data.replace(qacc=data.qacc_smooth))
-    return mjx.sensor_acc(model, solve_constraints(model, data))
+        return sensors.sensor_acc(model, data.replace(qacc=data.qacc_smooth))
+    return sensors.sensor_acc(model, solve_constraints(model, data))
 
 
 def solve_constraints(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -165,7 +174,7 @@ def runge_kutta_4(
     """
     start, timestep = data, model.opt.timestep
 
-    def follow(carry: tuple, row: jax.Array) -> tuple[tuple, None]:
+    def follow(carry: tuple, row: jax.Array) -> tuple[tuple, sensors.Shown]:
         """Evaluates a stage, adds its weighted rates, and moves from the start to the next."""
         stage, rate, sums = carry
         position, weight, next_position = row
@@ -175,6 +184,7 @@ def runge_kutta_4(
         # 1.7). What stops before the minimum has to start there.
         if not early_stop.stops_early(model):
             stage = stage.replace(qacc_warmstart=stage.qacc)
+        shown = sensors.shown(model, stage)
         rate = _displacement_rate(model, stage.qvel, rate, position)
         rates = rate, stage.qacc, stage.act_dot
         sums = tuple(total + weight * x for total, x in zip(sums, rates, strict=True))
@@ -186,12 +196,14 @@ def runge_kutta_4(
             act=start.act + act_dot * timestep,
             time=start.time + next_position * timestep,
         )
-        return (stage, rate, sums), None
+        return (stage, rate, sums), shown
 
     # A loop, so that XLA compiles one forward pass instead of four.
     nothing = jax.tree.map(jnp.zeros_like, (data.qvel, data.qvel, data.act))
     rows = jnp.asarray(_STAGES, data.qpos.dtype)
-    (stage, _, sums), _ = jax.lax.scan(follow, (data, data.qvel, nothing), rows)
+    (stage, _, sums), shown = jax.lax.scan(follow, (data, data.qvel, nothing), rows)
+    # In C the sensors show the first stage.
+    stage = sensors.with_shown(stage, jax.tree.map(lambda stages: stages[0], shown))
     end = stage.replace(qpos=start.qpos, qvel=start.qvel, act=start.act, time=start.time)
     qvel, qacc, act_dot = sums
     # The next step starts its solver at the last stage's acceleration, and shows the mean.

@@ -1,0 +1,95 @@
+"""Forces on bodies, and the sensors of forces and accelerations, as in C MuJoCo 4.0.
+
+MJX leaves out the forces of spatial tendons (``tendons``) and the cutoff of a frame's acceleration,
+counts the rows of equalities and contacts whose flags are disabled, though nothing has made them,
+and fails where a sensor asks for contacts that cannot be.
+"""
+
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from mujoco import mjx
+
+from mjx_reinforce.engine.physics import tendons
+from mjx_reinforce.engine.physics.mjx_internals import jax_fields, with_contact, with_fields
+
+_NO_EQUALITY = mjx.DisableBit.EQUALITY | mjx.DisableBit.CONSTRAINT
+_NO_CONTACT = mjx.DisableBit.CONTACT | mjx.DisableBit.CONSTRAINT
+_OF_CONTACTS = mjx.SensorType.TOUCH, mjx.SensorType.CONTACT
+_OF_FRAMES = mjx.SensorType.FRAMELINACC, mjx.SensorType.FRAMEANGACC
+#: What shows forces on bodies, or what follows from them.
+_OF_BODIES = (
+    *(mjx.SensorType.ACCELEROMETER, mjx.SensorType.FORCE, mjx.SensorType.TORQUE),
+    *_OF_FRAMES,
+)
+#: A type that no sensor has.
+_NO_TYPE = -1
+_FOR_SENSORS = "cacc", "cfrc_int", "cfrc_ext", "subtree_linvel", "subtree_angmom"
+#: What is computed only for sensors.
+Shown: TypeAlias = dict[str, Any]
+
+
+def rne_postconstraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Computes cfrc_ext, cfrc_int and cacc, as ``mj_rnePostConstraint``."""
+    model, counted = _existing(model, data)
+    return _like(mjx.rne_postconstraint(model, _with_tendons(model, counted)), data)
+
+
+def sensor_acc(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Computes the sensors of forces and accelerations, as ``mj_sensorAcc``."""
+    model, counted = _existing(model, data)
+    if np.isin(model.sensor_type, _OF_BODIES).any():
+        counted = _with_tendons(model, counted)
+    if not jax_fields(counted).contact.dim.size:
+        kinds = np.where(np.isin(model.sensor_type, _OF_CONTACTS), _NO_TYPE, model.sensor_type)
+        model = model.replace(sensor_type=kinds)
+    return _like(_cut(model, mjx.sensor_acc(model, counted)), data)
+
+
+def _cut(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Returns the data with the accelerations of frames within their cutoffs."""
+    cut = np.isin(model.sensor_type, _OF_FRAMES) & (model.sensor_cutoff > 0)
+    if not cut.any():
+        return data
+    cutoff = np.repeat(np.where(cut, model.sensor_cutoff, np.inf), model.sensor_dim)
+    return data.replace(sensordata=jnp.clip(data.sensordata, -cutoff, cutoff))
+
+
+def shown(model: mjx.Model, data: mjx.Data) -> Shown:
+    """Returns what is computed only for sensors; nothing if the model has none."""
+    if not model.nsensor:
+        return {}
+    fields = {name: getattr(jax_fields(data), name) for name in _FOR_SENSORS}
+    return {"sensordata": data.sensordata, "fields": fields}
+
+
+def with_shown(data: mjx.Data, sensed: Shown) -> mjx.Data:
+    """Returns the data with what ``shown`` returned."""
+    if not sensed:
+        return data
+    return with_fields(data.replace(sensordata=sensed["sensordata"]), **sensed["fields"])
+
+
+def _like(computed: mjx.Data, data: mjx.Data) -> mjx.Data:
+    """Returns what was computed, with the contacts and the forces that the data had."""
+    contact = jax_fields(data).contact
+    return with_contact(computed.replace(xfrc_applied=data.xfrc_applied), contact, contact.dim)
+
+
+def _existing(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Model, mjx.Data]:
+    """Returns the model and data without the equalities and contacts whose flags are disabled."""
+    if model.opt.disableflags & _NO_EQUALITY:
+        model = model.replace(eq_type=np.full_like(model.eq_type, _NO_TYPE))
+    if model.opt.disableflags & _NO_CONTACT:
+        none = jax.tree.map(lambda x: x[:0], jax_fields(data).contact)
+        data = with_contact(data, none, none.dim[:0])
+    return model, data
+
+
+def _with_tendons(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Returns the data with the forces of spatial tendons among the forces applied to bodies."""
+    if not np.isin(mjx.WrapType.SITE, model.wrap_type):
+        return data
+    return data.replace(xfrc_applied=data.xfrc_applied + tendons.body_forces(model, data))
