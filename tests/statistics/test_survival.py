@@ -74,7 +74,7 @@ def exact_median(steps, solved, confidence=0.95):
     with localcontext(prec=60):
         for time, share, spread in counted_curve(steps, solved):
             ends = (share, share)
-            if 0 < share:
+            if share > 0:
                 log = (Decimal(share.numerator) / share.denominator).ln()
                 width = z * (Decimal(spread.numerator) / spread.denominator).sqrt() / -log
                 ends = ((log * width.exp()).exp(), (log * (-width).exp()).exp())
