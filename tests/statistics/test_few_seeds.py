@@ -104,7 +104,7 @@ def test_seeds_that_show_one_group_of_two_miss_the_mean():
     other = random.random((4000, 6)) < 0.3
     values = np.where(other, 100.0, 1000.0) + random.random(other.shape)
     low, high = mean_interval(values)
-    covered = (low < 730.5) & (high > 730.5)
-    assert not covered[~other.any(axis=1)].any()
-    assert covered.mean() == pytest.approx(1 - 0.7**6, abs=0.015)
-    assert covered[other.any(axis=1) & ~other.all(axis=1)].mean() > 0.98
+    covered, count = (low < 730.5) & (high > 730.5), other.sum(axis=1)
+    assert not covered[count == 0].any()
+    assert covered[(count > 0) & (count < 5)].all()
+    assert np.mean(count == 0) == pytest.approx(0.7**6, abs=0.02)
