@@ -274,7 +274,7 @@ def _outcome(content: Mapping[str, Any]) -> dict[str, Any]:
 def _read_curves(directory: Path) -> dict[str, np.ndarray]:
     """Returns the arrays of curves.npz, [R] or [E, R] of R runs."""
     path = directory / "curves.npz"
-    arrays = read_arrays(path)
+    arrays = read_arrays(path, _CURVES)
     with naming_damage(path):
         found = {name: arrays[name].astype(kind) for name, kind in _CURVES.items()}
         shapes = {name: x.shape[-1:] for name, x in found.items()}
