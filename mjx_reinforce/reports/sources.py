@@ -280,7 +280,14 @@ def _read_curves(directory: Path) -> dict[str, np.ndarray]:
         shapes = {name: x.shape[-1:] for name, x in found.items()}
         if len({*shapes.values()}) > 1 or len(found["eval_return"]) != len(found["env_steps"]):
             raise ValueError(f"its arrays are of different runs: {shapes}")
+        _check_steps(found["env_steps"])
         return found
+
+
+def _check_steps(env_steps: np.ndarray) -> None:
+    """Raises ValueError for env steps [E, R] that are negative, or fall between evaluations."""
+    if (np.diff(env_steps, axis=0, prepend=0) < 0).any():
+        raise ValueError("env_steps are negative, or fewer than at the evaluation before")
 
 
 def read_metrics(path: Path) -> dict[str, np.ndarray]:
@@ -289,8 +296,8 @@ def read_metrics(path: Path) -> dict[str, np.ndarray]:
     A last line or evaluation that is not whole, which a killed run may leave, is left out.
 
     Raises:
-      ValueError: the file cannot be read, a column is missing, an entry is no number, or the rows
-        are not in the order of the seeds.
+      ValueError: the file cannot be read, a column is missing, an entry is no number, the rows are
+        not in the order of the seeds, or env steps fall.
     """
     columns = read_columns(path, _METRICS)
     seed = columns["seed"]
@@ -302,6 +309,8 @@ def read_metrics(path: Path) -> dict[str, np.ndarray]:
         raise ValueError(f"{path} is damaged: its lines are not in the order of the seeds")
     shape = (-1, num_seeds)
     found = {name: columns[name][:whole].reshape(shape) for name in ("env_steps", "eval_return")}
+    with naming_damage(path):
+        _check_steps(found["env_steps"])
     return found | {"seed": seed[:num_seeds]}
 
 
@@ -320,8 +329,8 @@ def read_columns(path: Path, kinds: Mapping[str, Any]) -> dict[str, np.ndarray]:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"cannot read {path} ({error})") from error
-    header, *rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines())) or [[]]
-    with naming_damage(path):
+    with naming_damage(path):  # csv has a class of errors of its own
+        header, *rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines())) or [[]]
         entries = zip(*rows, strict=True) if rows else [()] * len(header)
         columns = dict(zip(header, entries, strict=True))
         return {name: np.array(columns[name], kind) for name, kind in kinds.items()}
