@@ -199,7 +199,7 @@ def _do(name: str) -> NoReturn:
     """Does what the command line of a command asks for, says what came of it, and exits.
 
     The status is 0 when done, 1 if files cannot be written or nothing is finite any more, 2 for bad
-    input, 130 after Ctrl-C and 143 after SIGTERM.
+    input, 130 after Ctrl-C, 143 after SIGTERM and 129 after SIGHUP.
 
     Args:
       name: of the command, "train" or "sweep".
