@@ -20,6 +20,10 @@ from mjx_reinforce.reports.findings import Findings, compute_findings, swept, wo
 from mjx_reinforce.settings.config import code_flags
 from mjx_reinforce.settings.flags import run_command
 from mjx_reinforce.store.provenance import version
+from mjx_reinforce.training.resume import BEGUN
+
+#: How the names of pages end.
+_PAGES = (".html", ".htm")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +37,8 @@ class ReportSettings:
     """Directories of runs or sweeps of one task."""
     output: Path | None = None
     """The page. By default report.html in the directory of the run or sweep; if there are several,
-    in the current folder. Pictures and tables go into a folder of that name, without .html."""
+    in the current folder. Pictures and tables go into a folder of that name, without .html; where
+    that folder has runs, into NAME-report."""
     overwrite: bool = False
     """Replace a page that exists, with its pictures and tables."""
 
@@ -47,8 +52,12 @@ def _report(settings: ReportSettings) -> None:
     """Writes a report, and says where it is."""
     if settings.output is not None:
         check_page(settings.output, settings.overwrite)
-    experiment = sources.read_experiment(settings.sources)
-    output = settings.output or _default_output(settings.sources)
+    # A folder of runs, as in hopper/*, may have pages about them, too.
+    chosen = [path for path in settings.sources if not _is_report(path)] or settings.sources
+    if pages := [str(path) for path in settings.sources if path not in chosen]:
+        print(f"left out, for they are reports: {', '.join(pages)}")
+    experiment = sources.read_experiment(chosen)
+    output = settings.output or _default_output(chosen)
     check_page(output, settings.overwrite)
     seconds = _write(experiment, output).seconds
     took = f"{output.stat().st_size / 1e6:.1f} MB, {seconds:.1f} s"
@@ -57,13 +66,12 @@ def _report(settings: ReportSettings) -> None:
 
 def _default_output(chosen: Sequence[Path]) -> Path:
     """Returns where a page goes: into what it is of, or, if that is several, the current folder."""
-    alone = len(dict.fromkeys(chosen)) == 1
-    return (chosen[0] if alone else Path()) / "report.html"
+    return (chosen[0] if len(chosen) == 1 else Path()) / "report.html"
 
 
 def check_page(output: Path, overwrite: bool) -> None:
     """Raises ValueError if the report cannot be written there, or would replace files unasked."""
-    check_output(output, overwrite, ".html", ".htm")
+    check_output(output, overwrite, *_PAGES)
     beside = _beside(output)
     if beside.exists() and not beside.is_dir():
         raise ValueError(f"{beside} is in the way of the pictures; choose another --output")
@@ -120,8 +128,19 @@ def _write(experiment: Experiment, output: Path) -> WrittenReport:
 
 
 def _beside(output: Path) -> Path:
-    """Returns the folder for a page's pictures and tables."""
-    return output.with_suffix("")
+    """Returns the folder for a page's pictures and tables, which is none that has runs."""
+    beside = output.with_suffix("")
+    while any(path for name in BEGUN for path in beside.rglob(name)):
+        beside = beside.with_name(f"{beside.name}-report")
+    return beside
+
+
+def _is_report(path: Path) -> bool:
+    """Returns whether a path is a page, or the folder of its pictures and tables."""
+    page = path.suffix.lower() in _PAGES and path.is_file()
+    return page or (
+        (path / "results.csv").is_file() and not any((path / x).exists() for x in BEGUN)
+    )
 
 
 def results_csv(findings: Findings) -> str:
