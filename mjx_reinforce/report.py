@@ -2,6 +2,7 @@
 
 import dataclasses
 import shlex
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import tyro
 
+from mjx_reinforce.console.streams import say_error
 from mjx_reinforce.export.run_files import seeds_in
 from mjx_reinforce.files import check_output, csv_text, write_bytes
 from mjx_reinforce.reports import document, sources, words
@@ -44,7 +46,10 @@ class ReportSettings:
 
 
 def main() -> None:
-    """Reads the command line, writes the report, and exits: 0 done, 2 bad input, 130 stopped."""
+    """Reads the command line, writes the report, and exits.
+
+    The status is 0 when done, 1 if files cannot be written, 2 for bad input, 130 after Ctrl-C.
+    """
     run_command(ReportSettings, "report", _report)
 
 
@@ -59,7 +64,12 @@ def _report(settings: ReportSettings) -> None:
     experiment = sources.read_experiment(chosen)
     output = settings.output or _default_output(chosen)
     check_page(output, settings.overwrite)
-    seconds = _write(experiment, output).seconds
+    try:
+        seconds = _write(experiment, output).seconds
+    except OSError as error:
+        gone = f"{output.parent} was moved or removed"
+        say_error(f"cannot write {output}: {error if output.parent.is_dir() else gone}")
+        sys.exit(1)
     took = f"{output.stat().st_size / 1e6:.1f} MB, {seconds:.1f} s"
     print(f"{output} ({took}), pictures and tables in {_beside(output)}")
 

@@ -246,7 +246,8 @@ def _refuse_full(error: RuntimeError | MemoryError | OSError, design: Design) ->
     So is refused a directory that is no longer there.
     """
     if isinstance(error, OSError):
-        if isinstance(error, MovedError) or not design.directory.is_dir():
+        missing = isinstance(error, FileNotFoundError) and not design.directory.is_dir()
+        if missing or isinstance(error, MovedError):
             refuse(str(MovedError(design.directory)), status=1)
         what, again = "sweep" if design.over else "run", "try again"
         if any((design.directory / name).exists() for name in resume.BEGUN):

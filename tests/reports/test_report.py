@@ -294,6 +294,16 @@ def test_what_a_report_wrote_does_not_stop_the_next(tmp_path, monkeypatch, capsy
     assert (status, "there is no directory report.html" in said) == (2, True)
 
 
+def test_a_directory_that_is_lost_meanwhile_is_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    make_measured_run(tmp_path / "a")
+    how = report.how_to_watch
+    monkeypatch.setattr(report, "how_to_watch", lambda *x: (Path("a").rename("b"), how(*x))[1])
+    status, said = said_by_main(monkeypatch, capsys, "a")
+    assert (status, Path("a").exists()) == (1, False)
+    assert said == "error: cannot write a/report.html: a was moved or removed\n"
+
+
 def test_a_source_that_is_named_twice_is_refused(tmp_path, monkeypatch, capsys):
     make_measured_run(tmp_path / "a", seeds="0:3")
     monkeypatch.chdir(tmp_path)
