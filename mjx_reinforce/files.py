@@ -10,14 +10,17 @@ import secrets
 import sys
 import tempfile
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
 from mjx_reinforce.engine.checks import explain
+from mjx_reinforce.engine.memory import gigabytes
 
+#: What arrays may take that are read from an archive: bytes, or how often its own.
+_UNPACKED, _TIMES = 2**26, 32
 #: Named arrays, as an archive (.npz) holds them.
 Arrays = dict[str, np.ndarray]
 
@@ -52,6 +55,31 @@ def check_folder(folder: Path) -> None:
     except OSError as error:
         missing = "" if folder.exists() else ", which does not exist"
         raise ValueError(f"cannot write to {folder}{missing}; choose another --output") from error
+
+
+class MovedError(FileNotFoundError):
+    """A directory was moved or removed while files were written into it."""
+
+    def __init__(self, directory: Path):
+        super().__init__(
+            f"{directory} was moved or removed before all of its files were written, and no more "
+            "are; where it is now, --resume goes on with it"
+        )
+
+
+def check_place(directory: Path, known: os.stat_result) -> None:
+    """Raises MovedError if a directory is not the one it was, though another be in its place.
+
+    Args:
+      directory: into which files are written.
+      known: what ``stat`` said of it.
+    """
+    try:
+        here = os.path.samestat(directory.stat(), known)
+    except (FileNotFoundError, NotADirectoryError):
+        here = False
+    if not here:
+        raise MovedError(directory)
 
 
 def check_output(path: Path, overwrite: bool, *endings: str) -> None:
@@ -135,34 +163,58 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = Fa
     write_bytes(path, content.getvalue())
 
 
-def read_arrays(path: Path, *, stored: bool = False) -> Arrays:
-    """Returns the arrays of a NumPy archive by their names; no pickle.
+def read_arrays(
+    path: Path, names: Collection[str] | None = None, *, stored: bool = False
+) -> Arrays:
+    """Returns arrays of a NumPy archive by their names; no pickle.
 
     Args:
       path: of the archive.
-      stored: refuse what is compressed, see ``check_stored``.
+      names: of the arrays; no other is read. None for all.
+      stored: refuse what is compressed, see ``check_archive``.
 
     Raises:
-      ValueError: it cannot be read, or is damaged.
+      ValueError: it cannot be read, or is damaged; or has no array of a name.
     """
     try:
-        if stored:
-            check_stored(path)
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            return {name: np.asarray(archive[name]) for name in archive.files}
+        with path.open("rb") as file:
+            check_archive(file, names, stored=stored)
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as archive:
+                present = archive.files if names is None else [x for x in names if x in archive]
+                arrays = {name: np.asarray(archive[name]) for name in present}
     except OSError as error:
         raise ValueError(f"cannot read {path} ({error.strerror})") from error
     except Exception as error:  # what zip and NumPy raise has no common class
         # NumPy's second sentence proposes to trust a pickle.
         reason = f"{type(error).__name__}: {error}".splitlines()[0].partition(". ")[0]
         raise ValueError(f"{path} is damaged: not a whole NumPy archive ({reason})") from error
+    if missing := [name for name in names or () if name not in arrays]:
+        raise ValueError(f"{path} is damaged: {missing[0]} is missing")
+    return arrays
 
 
-def check_stored(archive: Path | IO[bytes]) -> None:
-    """Raises ValueError for an archive with compressed parts: few bytes can ask for gigabytes."""
+def check_archive(
+    archive: IO[bytes], names: Collection[str] | None = None, *, stored: bool = False
+) -> None:
+    """Raises ValueError for an archive whose few bytes ask for gigabytes; nothing is unpacked.
+
+    Args:
+      archive: a file.
+      names: of the arrays that are to be read; None for all.
+      stored: refuse compressed arrays of any size.
+    """
+    size = archive.seek(0, os.SEEK_END)
     with zipfile.ZipFile(archive) as opened:
-        if packed := [part.filename for part in opened.infolist() if part.compress_type]:
-            raise ValueError(f"{packed[0]!a} is compressed")
+        parts = opened.infolist()
+    if stored and (packed := [part.filename for part in parts if part.compress_type]):
+        raise ValueError(f"{packed[0]!a} is compressed")
+    wanted = (x for x in parts if names is None or x.filename.removesuffix(".npy") in names)
+    total = sum(part.file_size for part in wanted)
+    if total > max(_UNPACKED, _TIMES * size):
+        raise ValueError(
+            f"its arrays take {gigabytes(total)}, too many times the {gigabytes(size)} of the file"
+        )
 
 
 def finite(value: object) -> Any:
@@ -187,10 +239,13 @@ def append(path: Path, content: bytes) -> None:
     """Adds bytes to a file, in time that does not depend on what it holds.
 
     Where the disk is full, or Ctrl-C comes in between, the file is left as it was.
+
+    Raises:
+      OSError: it cannot be written, or it is not there, and with it what it held before.
     """
     left = memoryview(content)
-    with path.open("ab", buffering=0) as file:
-        size = file.tell()
+    with path.open("r+b", buffering=0) as file:
+        size = file.seek(0, os.SEEK_END)
         try:
             while left:
                 left = left[file.write(left) :]

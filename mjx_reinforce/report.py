@@ -2,6 +2,7 @@
 
 import dataclasses
 import shlex
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import tyro
 
+from mjx_reinforce.console.streams import say_error
 from mjx_reinforce.export.run_files import seeds_in
 from mjx_reinforce.files import check_output, csv_text, write_bytes
 from mjx_reinforce.reports import document, sources, words
@@ -20,6 +22,10 @@ from mjx_reinforce.reports.findings import Findings, compute_findings, swept, wo
 from mjx_reinforce.settings.config import code_flags
 from mjx_reinforce.settings.flags import run_command
 from mjx_reinforce.store.provenance import version
+from mjx_reinforce.training.resume import BEGUN
+
+#: How the names of pages end.
+_PAGES = (".html", ".htm")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,13 +39,17 @@ class ReportSettings:
     """Directories of runs or sweeps of one task."""
     output: Path | None = None
     """The page. By default report.html in the directory of the run or sweep; if there are several,
-    in the current folder. Pictures and tables go into a folder of that name, without .html."""
+    in the current folder. Pictures and tables go into a folder of that name, without .html; where
+    that folder has runs, into NAME-report."""
     overwrite: bool = False
     """Replace a page that exists, with its pictures and tables."""
 
 
 def main() -> None:
-    """Reads the command line, writes the report, and exits: 0 done, 2 bad input, 130 stopped."""
+    """Reads the command line, writes the report, and exits.
+
+    The status is 0 when done, 1 if files cannot be written, 2 for bad input, 130 after Ctrl-C.
+    """
     run_command(ReportSettings, "report", _report)
 
 
@@ -47,23 +57,31 @@ def _report(settings: ReportSettings) -> None:
     """Writes a report, and says where it is."""
     if settings.output is not None:
         check_page(settings.output, settings.overwrite)
-    experiment = sources.read_experiment(settings.sources)
-    output = settings.output or _default_output(settings.sources)
+    # A folder of runs, as in hopper/*, may have pages about them, too.
+    chosen = [path for path in settings.sources if not _is_report(path)] or settings.sources
+    if pages := [str(path) for path in settings.sources if path not in chosen]:
+        print(f"left out, for they are reports: {', '.join(pages)}")
+    experiment = sources.read_experiment(chosen)
+    output = settings.output or _default_output(chosen)
     check_page(output, settings.overwrite)
-    seconds = _write(experiment, output).seconds
+    try:
+        seconds = _write(experiment, output).seconds
+    except OSError as error:
+        gone = f"{output.parent} was moved or removed"
+        say_error(f"cannot write {output}: {error if output.parent.is_dir() else gone}")
+        sys.exit(1)
     took = f"{output.stat().st_size / 1e6:.1f} MB, {seconds:.1f} s"
     print(f"{output} ({took}), pictures and tables in {_beside(output)}")
 
 
 def _default_output(chosen: Sequence[Path]) -> Path:
     """Returns where a page goes: into what it is of, or, if that is several, the current folder."""
-    alone = len(dict.fromkeys(chosen)) == 1
-    return (chosen[0] if alone else Path()) / "report.html"
+    return (chosen[0] if len(chosen) == 1 else Path()) / "report.html"
 
 
 def check_page(output: Path, overwrite: bool) -> None:
     """Raises ValueError if the report cannot be written there, or would replace files unasked."""
-    check_output(output, overwrite, ".html", ".htm")
+    check_output(output, overwrite, *_PAGES)
     beside = _beside(output)
     if beside.exists() and not beside.is_dir():
         raise ValueError(f"{beside} is in the way of the pictures; choose another --output")
@@ -120,8 +138,19 @@ def _write(experiment: Experiment, output: Path) -> WrittenReport:
 
 
 def _beside(output: Path) -> Path:
-    """Returns the folder for a page's pictures and tables."""
-    return output.with_suffix("")
+    """Returns the folder for a page's pictures and tables, which is none that has runs."""
+    beside = output.with_suffix("")
+    while any(path for name in BEGUN for path in beside.rglob(name)):
+        beside = beside.with_name(f"{beside.name}-report")
+    return beside
+
+
+def _is_report(path: Path) -> bool:
+    """Returns whether a path is a page, or the folder of its pictures and tables."""
+    page = path.suffix.lower() in _PAGES and path.is_file()
+    return page or (
+        (path / "results.csv").is_file() and not any((path / x).exists() for x in BEGUN)
+    )
 
 
 def results_csv(findings: Findings) -> str:

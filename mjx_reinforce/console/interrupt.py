@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM."""
+"""Ctrl-C, SIGTERM, and SIGHUP, which is the end of the terminal or of ssh."""
 
 import contextlib
 import functools
@@ -10,11 +10,11 @@ import threading
 from collections.abc import Callable, Iterable
 from typing import Any, NoReturn
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
 
 class Interrupt:
-    """Ends the process at Ctrl-C or SIGTERM, in one line; after ``defer`` it first asks.
+    """Ends the process at Ctrl-C, SIGTERM or SIGHUP, in one line; after ``defer`` it first asks.
+
+    SIGHUP stays ignored where it was, as ``nohup`` leaves it.
 
     It listens inside a ``with`` block, in a thread of its own: Python runs signal handlers in the
     main thread only, which may be inside a compiler for minutes. The process ends with
@@ -34,7 +34,10 @@ class Interrupt:
         self._heard, self._told = socket.socketpair()
         self._told.setblocking(False)
         self._descriptor = signal.set_wakeup_fd(self._told.fileno(), warn_on_full_buffer=False)
-        self._handlers = {number: signal.signal(number, _nothing) for number in _SIGNALS}
+        numbers = [signal.SIGINT, signal.SIGTERM]
+        if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+            numbers.append(signal.SIGHUP)
+        self._handlers = {number: signal.signal(number, _nothing) for number in numbers}
         _start_thread(self._listen)
         return self
 
@@ -67,6 +70,8 @@ class Interrupt:
     def defer(self, say: Callable[[str], None]) -> None:
         """From now on the first signal only sets ``number``; the second ends the process.
 
+        A second SIGHUP does not.
+
         Args:
           say: shows a line to the user.
         """
@@ -88,13 +93,15 @@ class Interrupt:
     def _listen(self) -> None:
         with self._heard:
             while heard := self._heard.recv(1):
-                if heard[0] in _SIGNALS:
+                if heard[0] in self._handlers:
                     self._act(heard[0])
 
     def _act(self, number: int) -> None:
         if self._say is None:
             self.leave(128 + number, _say_unbegun)
         if self.number is not None:
+            if number == signal.SIGHUP:
+                return  # the shell and the kernel send one each when a terminal ends
             self.leave(128 + number)
         self.number = number
         said = "stopping after the current block of updates or test; Ctrl-C again stops at once"

@@ -158,14 +158,48 @@ def read_policy(
         )
     with naming_damage(settings_path):
         policy = build_policy(settings)
-    num_seeds = len(arrays["normalizer/count"])
+        shapes = arrays_of(jax.eval_shape(functools.partial(_untrained, policy, settings)))
+    with naming_damage(actor_path):
+        num_seeds = _check_shapes(arrays, shapes)
     if seed is not None and not 0 <= seed < num_seeds:
         seeds = f"its seeds are 0 to {num_seeds - 1}" if num_seeds > 1 else "it has seed 0 alone"
         raise ValueError(f"{directory} has no seed {seed}: {seeds}")
+    with np.errstate(over="ignore"):  # a double that no float32 holds becomes infinite
+        arrays = {k: x.astype(jax.dtypes.canonicalize_dtype(x.dtype)) for k, x in arrays.items()}
     with naming_damage(actor_path):
         _check_finite(arrays, seed)
     actor = jax.tree.map(lambda x: jnp.asarray(x if seed is None else x[seed]), actor_of(arrays))
     return SavedPolicy(policy, actor, settings, num_seeds)
+
+
+def _untrained(policy: Policy, settings: dict[str, Any]) -> Actor:
+    """Returns an actor of a policy, of whose arrays the names, shapes and kinds are wanted."""
+    params = policy.init(jax.random.key(0))
+    return Actor(params=params, normalizer=normalize.init(settings["observation_size"]))
+
+
+def _check_shapes(arrays: Arrays, expected: dict[str, Any]) -> int:
+    """Returns how many seeds the arrays of an archive are of.
+
+    Args:
+      arrays: [S, ...] by name.
+      expected: what has the shape and the type of each, of one seed.
+
+    Raises:
+      ValueError: they are not those, or not of the same number of seeds.
+    """
+    for name in sorted(arrays.keys() ^ expected.keys()):
+        what = "is missing" if name in expected else "is in no policy of these settings"
+        raise ValueError(f"{name} {what}")
+    num_seeds = max((*arrays["normalizer/count"].shape[:1], 1))
+    for name, array in sorted(arrays.items()):
+        shape, kind = (num_seeds, *expected[name].shape), expected[name].dtype
+        if array.shape != shape or array.dtype.kind != np.dtype(kind).kind:
+            raise ValueError(
+                f"{name} is {array.dtype}{list(array.shape)}, and the settings in policy.json make "
+                f"it {kind}{list(shape)}"
+            )
+    return num_seeds
 
 
 def _check_finite(arrays: Arrays, seed: int | None) -> None:

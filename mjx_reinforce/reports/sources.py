@@ -19,6 +19,7 @@ from mjx_reinforce.reports.experiment import (
     Source,
     counted,
     lengthened,
+    setting_in_words,
     settings_in_words,
 )
 
@@ -45,7 +46,7 @@ _CURVES = {
 #: Those of a configuration.
 _COLUMNS = ("seed", "eval_return", "env_steps", "nonfinite")
 #: Settings that say where and how a run was kept, not what was trained.
-_HOUSEKEEPING = ("output", "resume", "checkpoint_every", "num_seeds", "seeds")
+_HOUSEKEEPING = ("output", "resume", "like", "checkpoint_every", "log", "num_seeds", "seeds")
 #: What should be the same of sources that are compared.
 _COMPARABLE = ("python", "packages", "git_commit", "device", "x64", "engine")
 
@@ -58,12 +59,17 @@ def read_experiment(sources: Sequence[Path]) -> Experiment:
     sweep (--seeds) are joined.
 
     Raises:
-      ValueError: there is no source, one is neither a run nor a sweep or is damaged (which file,
-        what is wrong in it), they are of different tasks, or shares do not fit each other.
+      ValueError: there is no source, one is named twice, is neither a run nor a sweep or is damaged
+        (which file, what is wrong in it), they are of different tasks, or shares do not fit each
+        other.
     """
     if not sources:
         raise ValueError("there is nothing to report on: name a run or a sweep directory")
-    found = [read_directory(Path(source)) for source in dict.fromkeys(sources)]
+    known: dict[Path, Path] = {}
+    for source in map(Path, sources):
+        if (first := known.setdefault(source.resolve(), source)) is not source:
+            raise ValueError(f"{first} and {source} are one directory: name each source once")
+    found = [read_directory(source) for source in known.values()]
     envs = list(dict.fromkeys(source.env for source in found))
     if len(envs) > 1:
         raise ValueError(
@@ -74,9 +80,11 @@ def read_experiment(sources: Sequence[Path]) -> Experiment:
     configurations = _told_apart(joined)
     for other in configurations[1:]:
         if not np.intersect1d(configurations[0].seed, other.seed).size:
+            names = ", ".join(map(setting_in_words, other.settings))
             raise ValueError(
                 f"{configurations[0].label} and {other.label} have no seed in common, so they "
-                "cannot be compared; train both with the same --seeds"
+                "cannot be compared: train both with the same --seeds. As shares of one run they "
+                f"would have to agree in {names}"
             )
     thresholds = [source.threshold for source in found if source.threshold is not None]
     provenance, disagree = _merge_provenance(found)
@@ -87,7 +95,7 @@ def read_experiment(sources: Sequence[Path]) -> Experiment:
         env=env,
         threshold=thresholds[0] if thresholds else None,
         configurations=configurations,
-        settings=_in_common([source.settings for source in found]),
+        settings=_in_common(found),
         provenance=provenance,
         timings=dict(timings),
         directories=[source.directory for source in joined for _ in source.configurations],
@@ -165,14 +173,19 @@ def _told_apart(sources: Sequence[Source]) -> list[Configuration]:
     ]
 
 
-def _in_common(settings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Returns the settings that all sources share."""
-    first, *others = settings
-    return {
+def _in_common(sources: Sequence[Source]) -> dict[str, Any]:
+    """Returns the settings that all configurations of all sources share."""
+    first, *others = (source.settings for source in sources)
+    swept = {name for source in sources for part in source.configurations for name in part.settings}
+    shared = {
         name: value
         for name, value in first.items()
-        if name not in _HOUSEKEEPING and all(name in x and x[name] == value for x in others)
+        if name not in (*_HOUSEKEEPING, *swept)
+        and all(name in x and x[name] == value for x in others)
     }
+    if words := shared.get("env_set"):  # of the environment's own settings, some may be swept
+        shared["env_set"] = [x for x in words if f"env_set.{x.partition('=')[0]}" not in swept]
+    return shared
 
 
 def _merge_provenance(sources: Sequence[Source]) -> tuple[dict[str, Any], list[str]]:
@@ -274,13 +287,20 @@ def _outcome(content: Mapping[str, Any]) -> dict[str, Any]:
 def _read_curves(directory: Path) -> dict[str, np.ndarray]:
     """Returns the arrays of curves.npz, [R] or [E, R] of R runs."""
     path = directory / "curves.npz"
-    arrays = read_arrays(path)
+    arrays = read_arrays(path, _CURVES)
     with naming_damage(path):
         found = {name: arrays[name].astype(kind) for name, kind in _CURVES.items()}
         shapes = {name: x.shape[-1:] for name, x in found.items()}
         if len({*shapes.values()}) > 1 or len(found["eval_return"]) != len(found["env_steps"]):
             raise ValueError(f"its arrays are of different runs: {shapes}")
+        _check_steps(found["env_steps"])
         return found
+
+
+def _check_steps(env_steps: np.ndarray) -> None:
+    """Raises ValueError for env steps [E, R] that are negative, or fall between evaluations."""
+    if (np.diff(env_steps, axis=0, prepend=0) < 0).any():
+        raise ValueError("env_steps are negative, or fewer than at the evaluation before")
 
 
 def read_metrics(path: Path) -> dict[str, np.ndarray]:
@@ -289,8 +309,8 @@ def read_metrics(path: Path) -> dict[str, np.ndarray]:
     A last line or evaluation that is not whole, which a killed run may leave, is left out.
 
     Raises:
-      ValueError: the file cannot be read, a column is missing, an entry is no number, or the rows
-        are not in the order of the seeds.
+      ValueError: the file cannot be read, a column is missing, an entry is no number, the rows are
+        not in the order of the seeds, or env steps fall.
     """
     columns = read_columns(path, _METRICS)
     seed = columns["seed"]
@@ -302,6 +322,8 @@ def read_metrics(path: Path) -> dict[str, np.ndarray]:
         raise ValueError(f"{path} is damaged: its lines are not in the order of the seeds")
     shape = (-1, num_seeds)
     found = {name: columns[name][:whole].reshape(shape) for name in ("env_steps", "eval_return")}
+    with naming_damage(path):
+        _check_steps(found["env_steps"])
     return found | {"seed": seed[:num_seeds]}
 
 
@@ -320,8 +342,8 @@ def read_columns(path: Path, kinds: Mapping[str, Any]) -> dict[str, np.ndarray]:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"cannot read {path} ({error})") from error
-    header, *rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines())) or [[]]
-    with naming_damage(path):
+    with naming_damage(path):  # csv has a class of errors of its own
+        header, *rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines())) or [[]]
         entries = zip(*rows, strict=True) if rows else [()] * len(header)
         columns = dict(zip(header, entries, strict=True))
         return {name: np.array(columns[name], kind) for name, kind in kinds.items()}

@@ -17,6 +17,8 @@ LEVEL = 0.05
 _COUNTS = (3, 5, 10)
 #: Fewer seeds than these give an interval that promises more than it keeps.
 _FEW_SEEDS = 20
+#: Seeds of a group that so few others may not show at all, and how often that is not rare.
+_GROUP, _RARE = 0.3, 0.05
 
 
 def number(value: float) -> str:
@@ -180,6 +182,14 @@ def caveats(findings: Findings) -> Iterator[str]:
         yield (
             f"A configuration has {counted(min(sizes), 'seed')}: with fewer than {_FEW_SEEDS}, "
             "intervals hold the truth less than 95% of the time. Below six, there are none."
+        )
+    fewest = min(filter(enough, sizes), default=_FEW_SEEDS)
+    if (unseen := (1 - _GROUP) ** fewest) > _RARE:
+        yield (
+            "Where returns fall in two groups far apart, an interval of so few seeds does not keep "
+            f"its 95%: if three seeds in ten are of the other group, {fewest} seeds show none of "
+            f"them {percent(unseen)} of the time, so the interval of the mean holds the truth at "
+            f"most {percent(1 - unseen)} of the time."
         )
     if failed := sum(int(np.sum(~np.isfinite(each.final))) for each in results):
         yield (

@@ -14,6 +14,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.streams import accept_everything, say_error, silence_alarms
+from mjx_reinforce.files import MovedError
 from mjx_reinforce.runs.design import Design, SweepSettings, check_swept, read_design, read_over
 from mjx_reinforce.runs.perform import Outcome, locked, perform
 from mjx_reinforce.settings.config import (
@@ -198,7 +199,7 @@ def _do(name: str) -> NoReturn:
     """Does what the command line of a command asks for, says what came of it, and exits.
 
     The status is 0 when done, 1 if files cannot be written or nothing is finite any more, 2 for bad
-    input, 130 after Ctrl-C and 143 after SIGTERM.
+    input, 130 after Ctrl-C, 143 after SIGTERM and 129 after SIGHUP.
 
     Args:
       name: of the command, "train" or "sweep".
@@ -240,8 +241,14 @@ def _train(name: str, interrupt: Interrupt) -> int:
 
 
 def _refuse_full(error: RuntimeError | MemoryError | OSError, design: Design) -> NoReturn:
-    """Refuses what met a full memory or disk, as ``refuse``; raises any other error again."""
+    """Refuses what met a full memory or disk, as ``refuse``; raises any other error again.
+
+    So is refused a directory that is no longer there.
+    """
     if isinstance(error, OSError):
+        missing = isinstance(error, FileNotFoundError) and not design.directory.is_dir()
+        if missing or isinstance(error, MovedError):
+            refuse(str(MovedError(design.directory)), status=1)
         what, again = "sweep" if design.over else "run", "try again"
         if any((design.directory / name).exists() for name in resume.BEGUN):
             again = f"go on with --resume {design.directory}{code_flags(vars(design.base))}"

@@ -14,7 +14,7 @@ from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.engine.checks import check_kind
 from mjx_reinforce.export.policy_files import Player, build_policy
 from mjx_reinforce.export.run_files import Which
-from mjx_reinforce.files import Arrays, read_arrays, read_json
+from mjx_reinforce.files import Arrays, naming_damage, read_arrays, read_json
 from mjx_reinforce.learning.policy import Actor, Policy
 from mjx_reinforce.runs.command_line import report_on
 from mjx_reinforce.runs.design import Design, check_swept
@@ -272,6 +272,8 @@ def read_results(directory: Path) -> SweepResults:
             f"{directory} has no results yet: the sweep is {record.get('status', 'unfinished')}; "
             f"go on with it by --resume {directory}"
         )
-    listed = record["configurations"]
-    values = [{k: x for k, x in one.items() if k != "configuration"} for one in listed]
-    return SweepResults(directory, values, **read_arrays(directory / "curves.npz"))
+    with naming_damage(directory / "sweep.json"):
+        listed = record["configurations"]
+        values = [{k: x for k, x in one.items() if k != "configuration"} for one in listed]
+    arrays = read_arrays(directory / "curves.npz", SweepResults._fields[2:])
+    return SweepResults(directory, values, **arrays)

@@ -22,6 +22,7 @@ from mjx_reinforce.console.commands import typed
 from mjx_reinforce.export.policy_files import actor_of, arrays_of, save_policy
 from mjx_reinforce.files import (
     Arrays,
+    check_place,
     read_arrays,
     remove_parts,
     write_arrays,
@@ -47,7 +48,8 @@ _CHECKPOINT_SECONDS = 60.0
 class Files(Observer[Seen]):
     """The files of a run or a sweep, all but the first and the last of which may fail.
 
-    What cannot be written while runs go on is a warning, and is tried again.
+    What cannot be written while runs go on is a warning, and is tried again. A directory that was
+    moved or removed ends them by ``files.MovedError``: its files would begin another.
 
     contents: what the first file says
     """
@@ -64,6 +66,7 @@ class Files(Observer[Seen]):
           say: shows a line to the user.
         """
         self._directory, self._prepared, self._say = directory, prepared, say
+        self._place = directory.stat()
         self.contents = dict(prepared.known)
         #: What could not be written when it was last tried, and what is said of it.
         self._failing: set[str] = set()
@@ -73,6 +76,7 @@ class Files(Observer[Seen]):
 
     def open(self) -> None:
         """Removes what a crash left of writing files."""
+        self._check_place()  # compiling took its time
         remove_parts(self._directory, *(self._directory / name for name in self._folders))
 
     def has(self, chunk: str) -> bool:
@@ -81,6 +85,7 @@ class Files(Observer[Seen]):
 
     def updated(self, driver: Seen, met: np.ndarray) -> None:
         """Saves if that is due; the last block is saved with its evaluation, by ``ended``."""
+        self._check_place()
         self._saved, every = False, driver.config.checkpoint_every
         due = time.perf_counter() - self._at >= _CHECKPOINT_SECONDS
         if every is not None:
@@ -117,9 +122,11 @@ class Files(Observer[Seen]):
           what: is written, for the warning.
           write: writes it, or raises OSError.
         """
+        self._check_place()
         try:
             write()
         except OSError as error:
+            self._check_place()
             if what not in self._failing:
                 problem = error.strerror or error
                 self._say(f"warning: cannot write {what} ({problem}){self._hope}")
@@ -127,6 +134,18 @@ class Files(Observer[Seen]):
             return False
         self._failing.discard(what)
         return True
+
+    def _folder(self, *names: str) -> Path:
+        """Returns a folder in the directory, which is made if it is not there."""
+        folder = self._directory
+        for name in names:
+            folder /= name
+            folder.mkdir(exist_ok=True)  # not its parents: the directory is never made anew
+        return folder
+
+    def _check_place(self) -> None:
+        """Raises MovedError if the directory is not where it was."""
+        check_place(self._directory, self._place)
 
     def _write_json(self, name: str, content: dict[str, Any]) -> None:
         write_json(self._directory / name, content)
@@ -202,6 +221,7 @@ class RunFiles(Files[Driver]):
 
     def finished(self, driver: Driver, summary: dict[str, Any]) -> None:
         """Writes the last files, summary.json last of all, or raises OSError."""
+        self._check_place()
         self._save_policies(driver)
         self._write_rows()
         write_arrays(self._directory / "returns.npz", driver.record.training(), compressed=True)
@@ -233,9 +253,9 @@ class RunFiles(Files[Driver]):
 
     def _save_policies(self, driver: Driver) -> None:
         """Writes the last and the best policies."""
-        folder, settings = self._directory / "policy", self._prepared.parts[0].ready.policy
-        save_policy(folder, driver.states.train_states.actor, settings)
-        save_policy(folder / "best", driver.best.actor, settings)
+        settings = self._prepared.parts[0].ready.policy
+        save_policy(self._folder("policy"), driver.states.train_states.actor, settings)
+        save_policy(self._folder("policy", "best"), driver.best.actor, settings)
 
     def _write_rows(self) -> None:
         """Appends to metrics.csv the rows that it lacks."""
@@ -288,6 +308,7 @@ class SweepFiles(Files[Training]):
 
     def open(self) -> None:
         """Begins, with sweep.json first: where that cannot be written, nothing was begun."""
+        self._check_place()
         self._write_json("sweep.json", self.contents)
         super().open()
         self._parts.mkdir(exist_ok=True)
@@ -299,7 +320,7 @@ class SweepFiles(Files[Training]):
 
     def began(self, driver: Training) -> None:
         """Takes a chunk to its newest checkpoint, if there is one."""
-        found = resume.read_checkpoints(self._folder(driver), self._say)
+        found = resume.read_checkpoints(self._checkpoints(driver), self._say)
         self._go_on(driver, next(found, None))
 
     def ended(self, driver: Training) -> None:
@@ -307,15 +328,18 @@ class SweepFiles(Files[Training]):
         if not driver.record.done():
             super().ended(driver)
             return
+        self._check_place()
         self._write_part(driver)
-        resume.remove_checkpoints(self._folder(driver))
+        resume.remove_checkpoints(self._checkpoints(driver))
 
     def finished(self, driver: Training, summary: dict[str, Any]) -> None:
         """Joins the parts so far, sorted; those of a sweep that ended go after sweep.json."""
-        parts = {path.stem: read_arrays(path) for path in sorted(self._parts.glob("*.npz"))}
+        self._check_place()
+        paths = sorted(self._parts.glob("*.npz"))
+        parts = {path.stem: read_arrays(path, stored=True) for path in paths}
         if parts:
             curves = join_parts([{name: part[name] for name in _CURVES} for part in parts.values()])
-            write_arrays(self._directory / "curves.npz", curves, compressed=True)
+            write_arrays(self._directory / "curves.npz", curves)
         if summary["status"] == "finished":
             shutil.rmtree(self._directory / "policies", ignore_errors=True)
             for part in self._prepared.parts:
@@ -325,9 +349,9 @@ class SweepFiles(Files[Training]):
             shutil.rmtree(self._parts)
 
     def _save_checkpoint(self, driver: Training) -> None:
-        resume.save(self._folder(driver), driver.checkpoint(), even=False)
+        resume.save(self._checkpoints(driver), driver.checkpoint(), even=False)
 
-    def _folder(self, driver: Training) -> Path:
+    def _checkpoints(self, driver: Training) -> Path:
         """Returns the folder of a chunk's checkpoints."""
         return self._parts / driver.runs.name
 
@@ -363,10 +387,11 @@ class SweepFiles(Files[Training]):
             ends = {name: values[kept] for name, values in last.items()}
             seeds, returns = ends.pop("seed"), ends.pop("eval_return").astype(np.float64)
             del ends["configuration"]
-            place = self._directory / "policies" / f"{number:03d}"
+            place = self._folder("policies", f"{number:03d}")
             config = self._prepared.design.configs[number]
             traced = {k: getattr(config, k) for k in part.group.settings if k in policy}
-            save_policy(place / "policy", actor_of(ends), policy | traced)
+            folder = self._folder("policies", place.name, "policy")
+            save_policy(folder, actor_of(ends), policy | traced)
             ranked = {"status": "finished", "final_returns": returns.tolist()}
             write_json(place / "summary.json", ranked)
             run = {"env": config.env, "horizon": part.ready.horizon}

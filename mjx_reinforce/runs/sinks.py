@@ -81,6 +81,7 @@ class TensorBoard:
         # Readers sort the files by name.
         place = f"{int(time.time()):010}.{socket.gethostname()}.{len([*folder.glob(EVENTS)]):04}"
         self._path = folder / f"events.out.tfevents.{place}"
+        self._path.touch()
         self._add(file_version="brain.Event:2")
         self._add(step=0 if updates is None else updates + 1, session_log={"status": "START"})
 

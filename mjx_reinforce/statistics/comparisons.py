@@ -115,6 +115,15 @@ def failures_as_worst(x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarra
     return np.where(np.isfinite(x), x, worst), np.where(np.isfinite(y), y, worst)
 
 
+def _of_order_one(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns x and y over a power of two, so that no sum and no square overflows or vanishes.
+
+    What does not depend on the unit keeps every bit.
+    """
+    _, exponent = np.frexp(max(np.max(np.abs(x)), np.max(np.abs(y))))
+    return np.ldexp(x, -exponent), np.ldexp(y, -exponent)
+
+
 def paired_difference(x: ArrayLike, y: ArrayLike, confidence: float = 0.95) -> Difference:
     """Returns how much higher the mean of x is than that of y on the same seeds: paired t-test.
 
@@ -228,7 +237,7 @@ def seeds_needed(
     Returns:
       None if 10,000 seeds are not enough, or the two have the same mean.
     """
-    x, y = failures_as_worst(x, y)
+    x, y = _of_order_one(*failures_as_worst(x, y))
     if np.mean(x) == np.mean(y):
         return None
     enough = np.flatnonzero(_power_by_seeds(x, y, alpha) >= power)
@@ -281,7 +290,7 @@ def wrong_winner(x: ArrayLike, y: ArrayLike, num_seeds: int, draws: int = 10_000
       The share of draws whose winner is not that of all seeds; a draw without a winner counts
       half. NaN where all seeds together have no winner.
     """
-    x, y = failures_as_worst(x, y)
+    x, y = _of_order_one(*failures_as_worst(x, y))
     random = np.random.default_rng(0)
     drawn = [v[random.integers(0, len(v), (draws, num_seeds))] for v in (x, y)]
     truth = np.sign(np.mean(x) - np.mean(y))

@@ -97,14 +97,13 @@ def median_steps(steps: ArrayLike, solved: ArrayLike, confidence: float = 0.95) 
       Env steps. NaN where half of the seeds never solved it; so is an end of the interval that
       the data do not bound, as both of too few seeds.
     """
-    curve = kaplan_meier(steps, solved, confidence)
+    curve, half = kaplan_meier(steps, solved, confidence), _half_solved(steps, solved)
     if not enough(np.size(steps), confidence):
-        return Estimate(_half(curve.steps, curve.probability), np.nan, np.nan)
-    # Where the interval is not defined, no seed is left or all are.
-    low, high = (
-        np.where(np.isnan(ends), curve.probability, ends) for ends in (curve.low, curve.high)
-    )
-    return Estimate(*(_half(curve.steps, share) for share in (curve.probability, low, high)))
+        return Estimate(half, np.nan, np.nan)
+    # Where an end is not defined, all seeds are left, or none is. Else it is no fraction, so that
+    # rounding decides nothing.
+    ends = (np.where(np.isnan(x), curve.probability, x) <= 0.5 for x in (curve.low, curve.high))
+    return Estimate(half, *(_first(curve.steps, below) for below in ends))
 
 
 def restricted_mean(
@@ -219,7 +218,25 @@ def mean_while_training(eval_return: np.ndarray, env_steps: np.ndarray, until: f
     return np.array(means)
 
 
-def _half(steps: np.ndarray, share: np.ndarray) -> float:
-    """Returns the first step at which the share is at most a half, NaN if it never is."""
-    below = share <= 0.5
-    return float(steps[below.argmax()]) if below.any() else float("nan")
+def _half_solved(steps: ArrayLike, solved: ArrayLike) -> float:
+    """Returns the first step after which at most half of the seeds are left, NaN if there is none.
+
+    The share that is left is counted in whole numbers: the product of fractions that scipy rounds
+    may come out above a half where it is one.
+    """
+    steps, solved = np.asarray(steps, float), np.asarray(solved, bool)
+    times, events = np.unique(steps[solved], return_counts=True)
+    at_risk = len(steps) - np.searchsorted(np.sort(steps), times)
+    left = 1
+    total = 1
+    for time, risk, solving in zip(times.tolist(), at_risk.tolist(), events.tolist(), strict=True):
+        left *= risk - solving
+        total *= risk
+        if 2 * left <= total:
+            return time
+    return float("nan")
+
+
+def _first(steps: np.ndarray, holds: np.ndarray) -> float:
+    """Returns the first of the steps at which something holds, NaN if it never does."""
+    return float(steps[holds.argmax()]) if holds.any() else float("nan")

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_reinforce.engine.checks import fits
-from mjx_reinforce.files import Arrays, check_stored, read_json, write_bytes
+from mjx_reinforce.files import Arrays, check_archive, read_json, write_bytes
 from mjx_reinforce.settings.config import Config, flag, marked
 from mjx_reinforce.settings.declare import MAX_COUNT, Mark
 
@@ -263,7 +263,7 @@ def _read(path: Path) -> bytes | None:
     """Returns the contents of a checkpoint, or None if they are not those that were written."""
     try:
         content = path.read_bytes()
-        check_stored(io.BytesIO(content))
+        check_archive(io.BytesIO(content), stored=True)
     except (OSError, ValueError, zipfile.BadZipFile):
         return None
     return content if _digest(content) == path.stem.rpartition("-")[2] else None

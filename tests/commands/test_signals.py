@@ -113,6 +113,35 @@ def test_signals_and_kills_cost_no_byte(tmp_path):
 
 
 @pytest.mark.slow
+def test_an_ssh_that_ends_is_answered_as_sigterm(tmp_path):
+    """With a summary and a last checkpoint, from which the run goes on."""
+    process = start(tmp_path, *FOREVER)
+    wait_for(lambda: rows(tmp_path) > 20, process)
+    for _ in range(2):
+        process.send_signal(signal.SIGHUP)
+        time.sleep(0.05)
+    assert finish(process) == 128 + signal.SIGHUP
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["status"] == "interrupted"
+    assert len(list((tmp_path / "out" / "checkpoint").iterdir())) == 1
+
+
+@pytest.mark.slow
+def test_nohup_keeps_a_run_going(tmp_path):
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # which its child has too
+    try:
+        process = start(tmp_path, *FOREVER)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    wait_for(lambda: rows(tmp_path) > 20, process)
+    process.send_signal(signal.SIGHUP)
+    reached = rows(tmp_path)
+    wait_for(lambda: rows(tmp_path) > reached + 20, process)
+    process.send_signal(signal.SIGTERM)
+    assert finish(process) == 128 + signal.SIGTERM
+
+
+@pytest.mark.slow
 def test_a_signal_while_compiling_leaves_nothing(tmp_path):
     process = start(tmp_path, *HEAVY, cache=tmp_path / "cache")
     assert any("Training 4 seeds" in line for line in process.stdout)

@@ -128,6 +128,18 @@ def content(name, value):
     return lambda run: (run / name).write_bytes(value)
 
 
+def without(name):
+    """An archive that lacks an array, with a checksum of what is left."""
+
+    def spoil(run):
+        with np.load(run / NPZ) as archive:
+            kept = {x: archive[x] for x in archive if x not in (name, "checksum")}
+        np.savez(run / NPZ, checksum="", **kept)
+        change_arrays(run)
+
+    return spoil
+
+
 def flip_a_bit(run):
     path = run / "policy" / "actor.npz"
     damaged = bytearray(path.read_bytes())
@@ -182,6 +194,33 @@ DAMAGE = {
         "checksum",
     ),
     "a bit": (flip_a_bit, NPZ, "damaged"),
+    "no kernel": (without(KERNEL.replace("__", "/")), NPZ, "Dense_0/kernel is missing"),
+    "a row less": (arrays(**{KERNEL: lambda x: x[:, 1:]}), NPZ, "float32[3, 3, 8], and the set"),
+    "a seed less": (arrays(**{KERNEL: lambda x: x[1:]}), NPZ, "make it float32[3, 4, 8]"),
+    "one seed's counts": (arrays(normalizer__count=lambda x: x[:1]), NPZ, "make it float32[1"),
+    "no seed": (arrays(normalizer__count=lambda x: x[:0]), NPZ, "normalizer/count is float32[0]"),
+    "no axis of seeds": (arrays(normalizer__count=lambda x: x[0]), NPZ, "make it float32[1"),
+    "complex": (arrays(**{KERNEL: lambda x: x + 0j}), NPZ, "kernel is complex64[3, 4, 8], and"),
+    "whole numbers": (arrays(**{KERNEL: lambda x: x.astype(int)}), NPZ, "is int64[3, 4, 8], and"),
+    "text": (arrays(**{KERNEL: lambda x: x.astype("U9")}), NPZ, "is <U9[3, 4, 8], and"),
+    "beyond float32": (
+        arrays(**{KERNEL: lambda x: np.full(x.shape, 1e300)}),
+        NPZ,
+        "seed 1 has numbers that are not",
+    ),
+    "other layers": (
+        signed(hidden_sizes=[9, 8]),
+        NPZ,
+        "Dense_0/bias is float32[3, 8], and",
+    ),
+    "huge layers": (signed(hidden_sizes=[10**9, 10**9]), "policy", "is damaged"),
+    "deeper": (signed(hidden_sizes=[8, 8, 8]), NPZ, "Dense_3/bias is missing"),
+    "fewer layers": (signed(hidden_sizes=[8]), NPZ, "Dense_2/bias is in no policy of these"),
+    "another observation": (signed(observation_size=5), NPZ, "m2 is float32[3, 4], and"),
+    "three actions": (signed(num_actions=3), NPZ, "and the settings in policy.json make"),
+    "many actions": (signed(num_actions=10**12), "policy", "is damaged"),
+    "less than no action": (signed(num_actions=-2), JSON, "is damaged"),
+    "half an observation": (signed(observation_size=4.5), JSON, "observation_size"),
     "compressed arrays": (pack, NPZ, "is compressed"),
 }
 

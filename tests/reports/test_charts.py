@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from fake_sweeps import make_sweep
+from measured_runs import ONE
 from pages import findings_of
 
 from mjx_reinforce.reports import charts, findings, words
@@ -79,6 +80,17 @@ def test_defaults_are_named_where_settings_are_compared(found):
     assert any(said in one for one in words.caveats(found))
     own = found._replace(experiment=found.experiment._replace(env="own:Task"))
     assert not any(said in one for one in words.caveats(own))
+
+
+@pytest.mark.parametrize(
+    ("num_seeds", "covered"), [(6, "88.2%"), (8, "94.2%"), (9, None), (5, None)]
+)
+def test_the_page_says_what_few_seeds_may_not_show(tmp_path, num_seeds, covered):
+    """That is, one group of two; with fewer than six seeds there is no interval."""
+    found = findings_of(make_sweep(tmp_path, num_seeds=num_seeds, evaluations=3, over=ONE))
+    said = [one for one in words.caveats(found) if "two groups far apart" in one]
+    assert len(said) == (covered is not None)
+    assert all(f"at most {covered} of the time" in one for one in said)
 
 
 def test_captions_have_the_numbers_of_the_findings(found, drawn):

@@ -1,10 +1,12 @@
 """Reading the directory of a run or a sweep: what is whole is read, what is damaged is named."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
 
+from mjx_reinforce import report
 from mjx_reinforce.reports.sources import read_directory, read_metrics
 
 HEADER = "seed,env_steps,eval_return,entropy\n"
@@ -65,12 +67,28 @@ def test_a_last_evaluation_that_is_not_whole_is_left_out(run, end):
         (HEADER + ROWS[0] + "1,12\n", "is shorter"),
         (HEADER + "".join(ROWS[i] for i in (0, 1, 3, 2)), "order of the seeds"),
         (HEADER + ROWS[0] + ROWS[0] + ROWS[1], "order of the seeds"),
+        (HEADER + "0,10,1.5," + 131_073 * "2" + "\n", "metrics.csv is damaged: .*field larger"),
+        (HEADER + '0,10,"1.5' + 131_073 * "\n2" + "\n", "metrics.csv is damaged: "),
+        (HEADER + "0,10,1.5,2\0\n0,1\0,1.5,2\n", "metrics.csv is damaged: "),
+        (HEADER + "0,10,1\r5,2\n", "metrics.csv is damaged: "),
+        (HEADER + "0,-10,1.5,2\n", "metrics.csv is damaged: env_steps are negative, or fewer"),
+        (HEADER + ROWS[0] + ROWS[1] + "0,9,1.5,2\n1,22,3.0,2\n", "or fewer than at the eval"),
     ],
 )
 def test_a_damaged_table_is_named_with_its_line(run, text, message):
     (run / "metrics.csv").write_text(text)
     with pytest.raises(ValueError, match=message):
         read_metrics(run / "metrics.csv")
+
+
+def test_a_table_that_csv_refuses_is_one_line(run, capsys, monkeypatch):
+    (run / "metrics.csv").write_text(HEADER + "0,10,1.5," + 131_073 * "2" + "\n")
+    monkeypatch.setattr(sys, "argv", ["report", str(run)])
+    with pytest.raises(SystemExit, match="2"):
+        report.main()
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "metrics.csv is damaged" in said
 
 
 def test_a_table_that_cannot_be_read(run):
@@ -167,6 +185,7 @@ def test_a_damaged_sweep_json_is_named(sweep, change, message):
         ({"seed": np.array(["a", "b", "c"])}, "curves.npz is damaged: invalid literal .*'a'"),
         ({"seed": np.zeros(2, int)}, "curves.npz is damaged: its arrays .*'seed': .2,"),
         ({"env_steps": np.zeros((1, 3))}, "curves.npz is damaged: its arrays"),
+        ({"env_steps": -ARRAYS["env_steps"]}, "curves.npz is damaged: env_steps are negative"),
     ],
 )
 def test_damaged_curves_are_named(sweep, arrays, message):

@@ -242,7 +242,7 @@ def test_pages_go_where_they_belong(tmp_path, monkeypatch, capsys):
     first, second = make_measured_run(tmp_path / "a"), make_measured_run(tmp_path / "b")
     for chosen, page in (
         ([first], first / "report.html"),
-        ([second, second], second / "report.html"),
+        ([second], second / "report.html"),
         ([first, second], tmp_path / "report.html"),
     ):
         assert said_by_main(monkeypatch, capsys, *chosen)[0] == 0
@@ -259,6 +259,58 @@ def test_pages_go_where_they_belong(tmp_path, monkeypatch, capsys):
         2,
         f"error: there is no directory {tmp_path / 'none'}; name that of a run or a sweep\n",
     )
+
+
+def test_a_report_never_writes_among_runs(tmp_path, monkeypatch, capsys):
+    """As in clusters.md: the folder of shares has the name of the page; and again, over it."""
+    monkeypatch.chdir(tmp_path)
+    for k in range(2):
+        make_measured_run(Path(f"hopper/{k}"), first=3 * k, seeds=f"{3 * k}:{3 * k + 3}")
+    before = sorted(Path("hopper").rglob("*"))
+    for more in ((), ("--overwrite",)):
+        command = ("hopper/0", "hopper/1", "--output", "hopper.html", *more)
+        status, said = said_by_main(monkeypatch, capsys, *command)
+        assert (status, "pictures and tables in hopper-report\n" in said) == (0, True)
+        assert Path("hopper-report/results.csv").is_file()
+        assert sorted(Path("hopper").rglob("*")) == before
+    assert said_by_main(monkeypatch, capsys, "hopper/0", "--output", "hopper/0.html")[0] == 0
+    assert sorted(path.name for path in Path("hopper/0").iterdir()) == [
+        *("config.json", "metrics.csv", "summary.json")
+    ]
+
+
+def test_what_a_report_wrote_does_not_stop_the_next(tmp_path, monkeypatch, capsys):
+    """Where the runs are, whose page names all that is there."""
+    for k in range(2):
+        make_measured_run(tmp_path / f"{k}", first=3 * k, seeds=f"{3 * k}:{3 * k + 3}")
+    monkeypatch.chdir(tmp_path)
+    assert said_by_main(monkeypatch, capsys, "0", "1")[0] == 0
+    there = sorted(path.name for path in tmp_path.iterdir())
+    assert there == ["0", "1", "report", "report.html"]
+    status, said = said_by_main(monkeypatch, capsys, *there, "--overwrite")
+    assert status == 0
+    assert said.startswith("left out, for they are reports: report, report.html\n")
+    status, said = said_by_main(monkeypatch, capsys, "report.html")
+    assert (status, "there is no directory report.html" in said) == (2, True)
+
+
+def test_a_directory_that_is_lost_meanwhile_is_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    make_measured_run(tmp_path / "a")
+    how = report.how_to_watch
+    monkeypatch.setattr(report, "how_to_watch", lambda *x: (Path("a").rename("b"), how(*x))[1])
+    status, said = said_by_main(monkeypatch, capsys, "a")
+    assert (status, Path("a").exists()) == (1, False)
+    assert said == "error: cannot write a/report.html: a was moved or removed\n"
+
+
+def test_a_source_that_is_named_twice_is_refused(tmp_path, monkeypatch, capsys):
+    make_measured_run(tmp_path / "a", seeds="0:3")
+    monkeypatch.chdir(tmp_path)
+    for other in ("a", "./a", tmp_path / "a", "a/../a"):
+        status, said = said_by_main(monkeypatch, capsys, "a", other)
+        assert status == 2
+        assert said == f"error: a and {Path(other)} are one directory: name each source once\n"
 
 
 @pytest.mark.parametrize("name", ["page.txt", "none/page.html", "folder.html", "page.html"])

@@ -46,6 +46,39 @@ def test_shares_of_a_run_are_one_run(tmp_path):
     assert [path.name for path in part.where] == ["a", "a", "a", "b", "b"]
 
 
+@pytest.mark.parametrize(
+    "housekeeping", [{"log": ["tensorboard"]}, {"checkpoint_every": 5}, {"like": "other"}]
+)
+def test_shares_that_were_kept_otherwise_are_joined(tmp_path, housekeeping):
+    """What was logged, and how often saved, is nothing that was trained."""
+    first = make_measured_run(tmp_path / "a", seeds="0:3", log=[], checkpoint_every=None, like=None)
+    kept = {"log": [], "checkpoint_every": None, "like": None} | housekeeping
+    second = make_measured_run(tmp_path / "b", first=3, seeds="3:6", **kept)
+    (part,) = sources.read_experiment([first, second]).configurations
+    assert part.seed.tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_shares_that_differ_are_told_in_what(tmp_path):
+    first = make_measured_run(tmp_path / "a", seeds="0:3", discount=0.9, log=[])
+    other = {"learning_rate": 0.5, "discount": 0.99, "log": ["wandb"]}
+    second = make_measured_run(tmp_path / "b", first=3, seeds="3:6", **other)
+    said = r"As shares of one run they would have to agree in learning rate, discount$"
+    with pytest.raises(ValueError, match=said):
+        sources.read_experiment([first, second])
+
+
+def test_what_was_swept_is_nothing_that_all_share(tmp_path):
+    """Neither of one sweep, whose base has a value that no configuration had, nor of two."""
+    base = {"learning_rate": 0.005, "discount": 0.9, "env_set": ["frame_skip=2", "mass=3"]}
+    over = {"learning_rate": [0.01, 0.03], "env_set.mass": [1.0, 2.0]}
+    first = make_sweep(tmp_path / "a", over=over, settings=base)
+    second = make_sweep(tmp_path / "b", over={"estimator": ["mine", "theirs"]}, settings=base)
+    shared = {"discount": 0.9, "env_set": ["frame_skip=2"]}
+    assert sources.read_experiment([first]).settings == shared
+    assert sources.read_experiment([first, second]).settings == shared
+    assert sources.read_experiment([second]).settings == base
+
+
 def test_shares_of_a_sweep_are_one_sweep(tmp_path):
     shares = [make_sweep(tmp_path / name, num_seeds=2) for name in ("a", "b")]
     for number, share in enumerate(shares):

@@ -175,6 +175,23 @@ def test_small_effects_need_many_seeds_or_too_many():
     assert seeds_needed(NORMAL, NORMAL) is None
 
 
+@pytest.mark.parametrize("scale", [1e-300, 1e300])
+def test_no_unit_changes_what_many_seeds_say(scale):
+    """Although squares of such returns overflow, or vanish."""
+    x, y = scale * (NORMAL + 1), scale * NORMAL
+    assert seeds_needed(x, y) == seeds_needed(NORMAL + 1, NORMAL)
+    assert wrong_winner(x, y, 3) == wrong_winner(NORMAL + 1, NORMAL, 3)
+
+
+def test_seeds_needed_at_the_ends_of_the_numbers():
+    """Two constants need four, whose orders are rare enough; one huge value is mostly noise."""
+    assert seeds_needed([1e300] * 8, [-1e300] * 8) == 4
+    assert seeds_needed([1e308] * 8, [-1e308] * 8) == 4
+    outlier = [1.0, *[0.0] * 7]
+    expected = seeds_needed(outlier, [0.0] * 8)
+    assert seeds_needed([1e308, 1, 2, 3, 4, 5, 6, 7], [0.0] * 8) == expected > 4
+
+
 def test_failed_seeds_are_the_worst():
     x, y = np.full(100, 10.0), np.full(100, 10.0)
     y[:50] = np.nan

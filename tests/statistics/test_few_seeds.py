@@ -96,3 +96,15 @@ def test_times_of_few_seeds_have_no_interval(steps, mean, median):
 def test_two_constants_need_as_many_seeds_as_have_orders_enough():
     assert seeds_needed(np.full(9, 2.0), np.full(9, 1.0)) == 4
     assert seeds_needed(np.full(9, 2.0), np.full(9, 1.0), alpha=0.001) == 7
+
+
+def test_seeds_that_show_one_group_of_two_miss_the_mean():
+    """Three in ten are of a group far apart: six seeds show none of it in 0.7^6 of the draws."""
+    random = np.random.default_rng(3)
+    other = random.random((4000, 6)) < 0.3
+    values = np.where(other, 100.0, 1000.0) + random.random(other.shape)
+    low, high = mean_interval(values)
+    covered, count = (low < 730.5) & (high > 730.5), other.sum(axis=1)
+    assert not covered[count == 0].any()
+    assert covered[(count > 0) & (count < 5)].all()
+    assert np.mean(count == 0) == pytest.approx(0.7**6, abs=0.02)

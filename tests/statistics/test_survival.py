@@ -1,5 +1,9 @@
 """Env steps to a threshold against hand counts."""
 
+import math
+from decimal import Decimal, localcontext
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -50,6 +54,65 @@ def test_median_by_hand():
     assert np.isnan(value)
     assert low == 10  # so few could be the half
     assert np.isnan(high)
+
+
+def counted_curve(steps, solved):
+    """Yields each time at which seeds solve, the share left after it, and Greenwood's sum."""
+    share, spread = Fraction(1), Fraction(0)
+    for time in sorted({t for t, done in zip(steps, solved, strict=True) if done}):
+        risk = sum(t >= time for t in steps)
+        events = sum(done and t == time for t, done in zip(steps, solved, strict=True))
+        share *= Fraction(risk - events, risk)
+        spread += Fraction(events, risk * (risk - events)) if risk > events else 0
+        yield time, share, spread
+
+
+def exact_median(steps, solved, confidence=0.95):
+    """The median and its ends (Brookmeyer and Crowley, log-log), without rounding the share."""
+    found = [math.nan] * 3
+    z = Decimal(stats.norm.ppf((1 + confidence) / 2))
+    with localcontext(prec=60):
+        for time, share, spread in counted_curve(steps, solved):
+            ends = (share, share)
+            if share > 0:
+                log = (Decimal(share.numerator) / share.denominator).ln()
+                width = z * (Decimal(spread.numerator) / spread.denominator).sqrt() / -log
+                ends = ((log * width.exp()).exp(), (log * (-width).exp()).exp())
+            for place, value in enumerate((share, *ends)):
+                if math.isnan(found[place]) and value <= Fraction(1, 2):
+                    found[place] = time
+    return found
+
+
+def half_solved(num_seeds):
+    """Half solve it one after another, the others never."""
+    return range(1, num_seeds + 1), [place < num_seeds // 2 for place in range(num_seeds)]
+
+
+@pytest.mark.parametrize("num_seeds", [24, 38, 44, 46, 54, 62, 66, 74, 88, 102, 104, 128, 1000])
+def test_the_median_where_exactly_half_solved_it(num_seeds):
+    assert median_steps(*half_solved(num_seeds)).value == num_seeds // 2
+
+
+@pytest.mark.parametrize("censored", [(13,), (7, 8, 9)])
+def test_the_median_where_seeds_before_it_are_censored(censored):
+    num_seeds, expected = (24, 12) if censored == (13,) else (15, 10)
+    steps = np.arange(1, num_seeds + 1)
+    assert median_steps(steps, ~np.isin(steps, censored)).value == expected
+
+
+def test_median_and_ends_are_those_of_fractions():
+    """Of all sizes to 40, with ties and censoring of every share; an exact half in 30 or more."""
+    random, halves = np.random.default_rng(5), 0
+    for num_seeds in range(6, 41):
+        for censored in (0.0, 0.1, 0.3, 0.5, 0.7):
+            for most in (num_seeds, 8):
+                steps = random.integers(1, most + 1, num_seeds).tolist()
+                solved = (random.random(num_seeds) >= censored).tolist()
+                halves += any(x == Fraction(1, 2) for _, x, _ in counted_curve(steps, solved))
+                found = median_steps(steps, solved)
+                np.testing.assert_array_equal(found, exact_median(steps, solved))
+    assert halves >= 30
 
 
 def test_median_interval_is_between_order_statistics():

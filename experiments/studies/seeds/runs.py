@@ -150,7 +150,7 @@ def measure(directory: Path) -> Task:
     A return that is not finite counts as the worst finite one of the sweep.
     """
     record = read_json(directory / "sweep.json")
-    runs = read_arrays(directory / "curves.npz")
+    runs = read_arrays(directory / "curves.npz", ("eval_return", "env_steps"))
     names = {setting: name for name, (setting, _) in _SETTINGS.items()}
     factors: dict[str, list[Any]] = {}
     for x, values in record["over"].items():
