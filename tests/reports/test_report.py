@@ -270,7 +270,7 @@ def test_outputs_that_cannot_be_are_refused(tmp_path, name):
         report.check_page(tmp_path / name, overwrite=False)
 
 
-@pytest.mark.parametrize(("seeds", "none"), [(8, "all seeds are alike"), (3, "too few seeds")])
+@pytest.mark.parametrize(("seeds", "none"), [(8, "all seeds are alike"), (3, "it takes six seeds")])
 def test_ties_are_said_as_ties(tmp_path, seeds, none):
     """Equal means are not "0.0 above", and p = 1 is not "or more"; no interval has no width."""
     directory = make_sweep(tmp_path / "sweep", num_seeds=seeds, over=ONE)
