@@ -77,8 +77,8 @@ def headline(findings: Findings) -> list[str]:
     best = findings.results[0]
     if math.isnan(best.mean.value):
         return ["There is no answer: no seed of any configuration ended with a finite return."]
-    why = "all seeds are alike" if enough(len(best.final)) else "it takes six seeds"
-    bounds = within(best.mean).replace("no interval", f"no interval: {why}")
+    why = ": all seeds are alike" if enough(len(best.final)) else " below six seeds"
+    bounds = within(best.mean).replace("no interval", f"no interval{why}")
     mean = f"a mean return of {number(best.mean.value)} ({bounds})"
     if len(findings.results) == 1:
         seeds, first = counted(len(best.final), "seed"), best.configuration.eval_return[0]

@@ -125,4 +125,4 @@ def test_what_is_solved_is_said_where_it_is_counted(tmp_path):
     )
     page = page_of(directory)
     assert "Solved: a return of 3,800.0, the threshold of Hopper-v5, or more." in visible(page)
-    assert "(no interval: it takes six seeds)" in visible(page)
+    assert "(no interval below six seeds)" in visible(page)
