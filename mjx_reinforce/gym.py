@@ -14,6 +14,7 @@ import gymnasium
 from gymnasium.vector import AutoresetMode
 
 from mjx_reinforce import envs
+from mjx_reinforce.engine.vector.pictures import import_mujoco
 from mjx_reinforce.settings.defaults import HORIZONS
 
 if TYPE_CHECKING:
@@ -50,8 +51,10 @@ def make(
       **options: further arguments of ``make_vec``, and of the task.
 
     Raises:
-      ValueError: as of ``make_vec``.
+      ValueError: as of ``make_vec``, or MuJoCo cannot draw here.
     """
+    if render_mode is not None:
+        import_mujoco()  # how it draws is settled when it is imported
     from mjx_reinforce.engine.vector.for_gymnasium import GymnasiumVectorEnv  # loads JAX
 
     vec = envs.make_vec(env, num_envs, autoreset=autoreset, **options)

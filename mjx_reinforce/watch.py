@@ -13,7 +13,8 @@ from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.jax_setup import configure_jax, warn
 from mjx_reinforce.console.streams import silence_alarms
 from mjx_reinforce.engine.checks import explain
-from mjx_reinforce.export.films import Take, check_drawing, gif, side_by_side, with_sky
+from mjx_reinforce.engine.vector.pictures import check_drawing
+from mjx_reinforce.export.films import Take, gif, side_by_side, with_sky
 from mjx_reinforce.export.run_files import Run, SeedChoice, Which, choose_seed, read_run
 from mjx_reinforce.files import check_output, write_bytes
 from mjx_reinforce.settings.config import check_named

@@ -103,6 +103,48 @@ def test_python_of_page_runs(name, tmp_path):
     run_smaller(name, "\n".join(blocks(page(name), "python")), tmp_path)
 
 
+#: What Stable-Baselines3's classes ask of a ``VecEnv``, in place of a package that needs torch.
+STAND_IN = """
+import sys, types
+class VecEnv:
+    def __init__(self, num_envs, observation_space, action_space):
+        self.num_envs, self.metadata, self._seeds = num_envs, {}, [None] * num_envs
+        (self.render_mode,) = set(self.get_attr("render_mode"))
+    def _get_indices(self, indices):
+        return range(self.num_envs)
+    def _reset_seeds(self):
+        pass
+names = "stable_baselines3", "common", "monitor", "vec_env"
+base, common, monitor, vec_env = map(types.ModuleType, names)
+base.PPO, base.common, monitor.Monitor, vec_env.VecEnv = None, common, object, VecEnv
+sys.modules |= {"stable_baselines3": base, "stable_baselines3.common": common}
+sys.modules |= {f"stable_baselines3.common.{x.__name__}": x for x in (monitor, vec_env)}
+"""
+#: As ``VecVideoRecorder`` films it.
+FILMED = """
+filmed = Environments("InvertedPendulum-v5", 2, render_mode="rgb_array")
+assert (filmed.render_mode, filmed.metadata["render_fps"]) == ("rgb_array", 25)
+filmed.reset()
+(before,) = filmed.get_images()
+for _ in range(5):
+    filmed.step_async(np.ones((2, 1)))
+    filmed.step_wait()
+(after,) = filmed.get_images()
+assert before.shape == after.shape == (240, 320, 3)
+assert np.any(before != after)
+filmed.close()
+"""
+
+
+@pytest.mark.slow
+def test_the_vec_env_of_the_page_is_filmed(tmp_path):
+    """The page's class for Stable-Baselines3, on a stand-in for what it is derived from."""
+    (code,) = re.findall(
+        r"^import numpy as np\nfrom stable.*?(?=^PPO)", page("vector.md"), re.S | re.M
+    )
+    run_smaller("vector.md", STAND_IN + code + FILMED, tmp_path)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(DOCS.glob("notebooks/*.py")), ids=lambda path: path.stem)
 def test_notebook_runs(path, tmp_path):

@@ -1,78 +1,22 @@
 """Films of episodes: MuJoCo's pictures of them, side by side, and the GIF that these become."""
 
-import ctypes.util
 import functools
 import io
 import math
-import os
 import warnings
-import weakref
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from mjx_reinforce.engine.vector.pictures import Renderer, import_mujoco
+
 if TYPE_CHECKING:
-    from mjx_reinforce.engine.base import MjModel, MjSpec
+    from mjx_reinforce.engine.base import MjSpec
 #: Colors of a .gif, beside the one that is transparent.
 _COLORS = 255
 #: Pictures, spread over a film, whose colors it has.
 SAMPLES = 4
-
-
-class Renderer:
-    """Draws a model at given positions, through its camera "track" if it has one.
-
-    Otherwise the picture goes with the body of the first joint, if nothing ties it to its place.
-    """
-
-    def __init__(self, model: "MjModel", width: int, height: int):
-        """Opens MuJoCo's renderer for pictures of so many pixels; see ``check_drawing``."""
-        mujoco = import_mujoco()
-        model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
-        model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-        model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.4, 0.6
-        # Without a GPU smooth edges take half the time of a picture, and show no better in it.
-        model.vis.quality.offsamples = 0
-        # Without a GPU a fine shadow takes half the time of a picture, and shows no better in it.
-        model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, max(width, height))
-        self._camera, self._followed = _camera(model)
-        self._model, self._data = model, mujoco.MjData(model)
-        self._renderer = mujoco.Renderer(model, height, width)
-        # Without this it closes itself when Python ends, too late for its own modules.
-        weakref.finalize(self, self._renderer.close)
-
-    def draw(self, qpos: np.ndarray) -> np.ndarray:
-        """Returns a picture [height, width, 3] uint8.
-
-        Args:
-          qpos: [nq] generalized positions.
-        """
-        mujoco, data = import_mujoco(), self._data
-        data.qpos[:] = qpos
-        mujoco.mj_forward(self._model, data)
-        if self._followed is not None:
-            self._camera.lookat[:] = data.subtree_com[self._followed]
-        # MuJoCo lays an endless floor around the camera of the scene before, which may be far away.
-        mujoco.mjv_updateCamera(self._model, data, self._camera, self._renderer.scene)
-        self._renderer.update_scene(data, self._camera)
-        return self._renderer.render()
-
-
-def _camera(model: "MjModel") -> tuple[Any, int | None]:
-    """Returns an ``MjvCamera``, and the number of the body that it looks at wherever that is."""
-    mujoco = import_mujoco()
-    camera = mujoco.MjvCamera()
-    mujoco.mjv_defaultFreeCamera(model, camera)
-    for number in range(model.ncam):
-        if model.camera(number).name == "track":
-            camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, number
-            return camera, None
-    first = model.jnt_bodyid[0] if model.njnt else -1  # the robot; what lies about comes later
-    ways = (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE) | (
-        (model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & (model.jnt_limited == 0)
-    )
-    return camera, int(first) if ways[model.jnt_bodyid == first].any() else None
 
 
 def with_sky(spec: "MjSpec") -> Any:
@@ -86,29 +30,6 @@ def with_sky(spec: "MjSpec") -> Any:
         spec.add_texture(name=name, type=sky, rgb1=overhead, rgb2=horizon, **gradient)
     with warnings.catch_warnings(action="ignore"):  # what MuJoCo deprecates in a model
         return spec.compile()
-
-
-def import_mujoco() -> Any:
-    """Returns MuJoCo; without a screen it is told to draw through EGL, where that is installed."""
-    if not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL"):
-        os.environ.setdefault("MUJOCO_GL", "egl")
-    import mujoco
-
-    return mujoco
-
-
-def check_drawing() -> None:
-    """Raises ValueError, with what to do, where MuJoCo cannot draw; it takes a moment."""
-    try:
-        with warnings.catch_warnings(action="ignore"):  # GLFW's, before it fails
-            mujoco = import_mujoco()
-            mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
-    except Exception as error:  # each of MuJoCo's backends has its own
-        how = f"with MUJOCO_GL={chosen}" if (chosen := os.environ.get("MUJOCO_GL")) else "here"
-        raise ValueError(
-            f"MuJoCo cannot draw {how} ({error}); set MUJOCO_GL=egl, or MUJOCO_GL=osmesa without a "
-            "GPU, and install what is missing (Debian: apt install libegl1 libosmesa6)"
-        ) from error
 
 
 #: Frames a second at most: what a film shows, and what GIF viewers play.

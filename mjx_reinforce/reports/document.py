@@ -16,6 +16,7 @@ from mjx_reinforce.reports.experiment import Experiment, counted, say, setting_i
 from mjx_reinforce.reports.findings import COMPARED, Findings
 from mjx_reinforce.reports.listings import listings
 from mjx_reinforce.reports.words import steps
+from mjx_reinforce.statistics import enough
 
 #: The charts in the order of the page.
 _CHARTS = (final, curves, solved, distribution, sensitivity)
@@ -115,6 +116,10 @@ def _text(findings: Findings, drawn: list[charts.Chart]) -> dict[str, Any]:
         "distrust": list(words.caveats(findings)),
         "figures": {name: figures.get(name) for name in names},
         "failures": failures,
+        "several": len(findings.results) > 1,
+        "few": not all(enough(len(each.final)) for each in findings.results),
+        "solved": findings.experiment.threshold is not None and words.solved(findings.experiment),
+        "two_ways": words.two_ways(findings),
         "pairs": counted(len(findings.comparisons), "pair"),
         "listed": listed,
         "until": steps(findings.until),

@@ -97,6 +97,11 @@ class Findings(NamedTuple):
     until: int
 
     @property
+    def intervals(self) -> bool:
+        """Whether the mean of any configuration has an interval."""
+        return any(math.isfinite(each.mean.low) for each in self.results)
+
+    @property
     def labels(self) -> list[str]:
         """The names of the configurations, the best first."""
         return [each.configuration.label for each in self.results]
@@ -105,6 +110,8 @@ class Findings(NamedTuple):
 def compute_findings(experiment: Experiment) -> Findings:
     """Computes all figures of a report."""
     parts = experiment.configurations
+    if len(parts) == 1 and not parts[0].settings:  # a run, whose directory has a long name
+        parts = [parts[0]._replace(label=experiment.env)]
     ends = [int(part.env_steps[-1].min()) for part in parts]
     # A seed stops after the update that reaches its budget, so that ends differ a little.
     grid = _curve_steps(parts, min(end for end in ends if end >= _SAME_BUDGET * max(ends)))

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from mjx_reinforce.reports.experiment import counted, ordered, say, setting_in_words
+from mjx_reinforce.reports.experiment import Experiment, counted, ordered, say, setting_in_words
 from mjx_reinforce.reports.findings import COMPARED, Findings, by_speed
 from mjx_reinforce.settings.defaults import OF_TASKS
 from mjx_reinforce.statistics import Estimate, enough
@@ -79,8 +79,8 @@ def headline(findings: Findings) -> list[str]:
     best = findings.results[0]
     if math.isnan(best.mean.value):
         return ["There is no answer: no seed of any configuration ended with a finite return."]
-    why = "all seeds are alike" if enough(len(best.final)) else "too few seeds"
-    bounds = within(best.mean).replace("no interval", f"no interval: {why}")
+    why = ": all seeds are alike" if enough(len(best.final)) else " below six seeds"
+    bounds = within(best.mean).replace("no interval", f"no interval{why}")
     mean = f"a mean return of {number(best.mean.value)} ({bounds})"
     if len(findings.results) == 1:
         seeds, first = counted(len(best.final), "seed"), best.configuration.eval_return[0]
@@ -114,8 +114,8 @@ def _ahead(findings: Findings) -> Iterator[str]:
     above = f"is {number(difference)} above" if difference else "equals"
     yield (
         f"The mean {above} that of the next, {findings.labels[next_best.second]} "
-        f"({within(next_best.difference)}; {p_value(next_best.adjusted)} after Holm's correction "
-        f"for {pairs})."
+        f"({within(next_best.difference)}; {p_value(next_best.adjusted)} by the paired t-test, "
+        f"after Holm's correction for {pairs})."
     )
     if ties:
         least = p_value(min(each.adjusted for each in ties))
@@ -140,10 +140,31 @@ def _solving(findings: Findings) -> Iterator[str]:
         rate, fell = best.solving.rate, int(best.solving.fell.sum())
         yield (
             f"{best.solving.at_end:,} of {whose}{counted(len(best.final), 'seed')} solve the task "
-            f"at the end ({percent(float(rate.value))}, {within(rate, percent)}; solved is a "
-            f"return of {number(findings.experiment.threshold or 0.0)})"
+            f"at the end ({percent(float(rate.value))}, {within(rate, percent)}; solved is "
+            f"{solved(findings.experiment)})"
             f"{f'; {fell:,} had solved it and fell back' if fell else ''}."
         )
+
+
+def solved(experiment: Experiment) -> str:
+    """Returns what a task counts as solved."""
+    return f"a return of {number(experiment.threshold or 0.0)}, the threshold of {experiment.env}"
+
+
+def two_ways(findings: Findings) -> str:
+    """Returns what it means where the best has the higher mean and loses to another, or nothing."""
+    against = [
+        findings.labels[pair.second]
+        for pair in of_best(findings)
+        if pair.difference.value > 0 and pair.improvement.value < 0.5
+    ]
+    if not against:
+        return ""
+    return (
+        f"The best has a higher mean than {_listed(against)}, but is better in less than half of "
+        "the pairs of seeds: it wins by more than it loses by. That is so where seeds fall in "
+        "groups, such as those that fail and those that do not; the histograms show them."
+    )
 
 
 def _few(findings: Findings) -> Iterator[str]:
@@ -155,8 +176,9 @@ def _few(findings: Findings) -> Iterator[str]:
         needed = seeds_needed(best, second)
         found = f"{needed:,} seeds of each would" if needed else "10,000 seeds of each would not"
         yield (
-            f"With few seeds, the wrong one would have won: {', '.join(wrong)}. {found} find the "
-            "difference four times out of five."
+            "With few seeds of the best and the next, the wrong one of these two would have won: "
+            f"{', '.join(wrong)}. {found} find the difference four times out of five, by Welch's "
+            "test, which does not pair seeds."
         )
 
 

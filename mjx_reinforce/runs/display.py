@@ -220,7 +220,7 @@ def summary_table(summary: dict[str, Any]) -> Table:
     low, high = summary["iqm_ci"]
     known = math.isfinite(low) and math.isfinite(high)
     interval = f"95% interval {low:.1f} to {high:.1f}" if known else "no interval"
-    interval += "" if enough(summary["num_seeds"]) else ": too few seeds"
+    interval += "" if enough(summary["num_seeds"]) else " below six seeds"
     table.add_row("return, interquartile mean over seeds", f"{summary['iqm']:.1f}  ({interval})")
     returns = np.array(summary["final_returns"])
     table.add_row("worst and best seed", f"{returns.min():.1f}, {np.fmax.reduce(returns):.1f}")

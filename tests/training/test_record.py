@@ -250,7 +250,7 @@ def test_the_end_table_has_counts(monkeypatch):
     monkeypatch.setattr(display, "_Screen", lambda **_: console)
     few = summarize(two, 950.0) | more | {"num_seeds": 2}
     display.Display().show_summary(few, Path("t"))
-    assert "586.8 (no interval: too few seeds)" in " ".join(console.file.getvalue().split())
+    assert "586.8 (no interval below six seeds)" in " ".join(console.file.getvalue().split())
     console = screen(80)
     ended = summarize(history, 950.0) | more
     display.Display().show_summary(ended, Path("t/[bold]x"))

@@ -7,7 +7,8 @@ import numpy as np
 
 from mjx_reinforce import Player, envs, load
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.export.films import SAMPLES, Film, Take, gif, import_mujoco, side_by_side
+from mjx_reinforce.engine.vector.pictures import import_mujoco
+from mjx_reinforce.export.films import SAMPLES, Film, Take, gif, side_by_side
 from mjx_reinforce.files import write_bytes
 from mjx_reinforce.watch import scene
 

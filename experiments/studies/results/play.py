@@ -14,7 +14,8 @@ from experiments.studies.results.runs import ended
 from experiments.studies.results.tasks import ROOT, Task
 from mjx_reinforce import Player, envs, load
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.export.films import Take, import_mujoco, side_by_side
+from mjx_reinforce.engine.vector.pictures import import_mujoco
+from mjx_reinforce.export.films import Take, side_by_side
 from mjx_reinforce.export.run_files import Run, read_run
 from mjx_reinforce.watch import scene
 

@@ -13,7 +13,10 @@ from mjx_reinforce.engine.base import Discrete, PyTree
 from mjx_reinforce.engine.checks import check_name
 from mjx_reinforce.engine.play.available import GENERATOR
 from mjx_reinforce.engine.vector.environment import VectorEnv, VectorState
+from mjx_reinforce.engine.vector.pictures import Renderer, check_drawing
 
+#: Width and height of a picture, in pixels: those of MuJoCo's own renderer.
+_PICTURE = (320, 240)
 #: A seed of all environments, or one for each.
 Seeds: TypeAlias = int | Sequence[int | None] | None
 
@@ -49,13 +52,16 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
           render_mode: "rgb_array", or None for no pictures.
 
         Raises:
-          ValueError: an argument has no such value, or there is nothing to render.
+          ValueError: an argument has no such value, there is nothing to render, or MuJoCo cannot
+            draw here.
         """
         check_name("arrays", arrays, _HAND_OUT)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be rgb_array or None, got {render_mode!r}")
         if render_mode and not hasattr(vec.env, "mj_model"):
             raise ValueError(f"{type(vec.env).__name__} has no MuJoCo model to render")
+        if render_mode:
+            check_drawing()
         self.vec, self.num_envs, self.render_mode = vec, vec.num_envs, render_mode
         self.state: VectorState | None = None
         dt = getattr(vec.env, "dt", None)
@@ -75,7 +81,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self._reset, self._restart = jax.jit(vec.reset), jax.jit(vec.restart)
         # What is handed out without a copy must outlive the next step.
         self._step = jax.jit(vec.step, donate_argnums=0 if arrays == "numpy" else ())
-        self._renderer: Any = None
+        self._renderer: Renderer | None = None
 
     def reset(
         self, *, seed: Seeds = None, options: dict[str, Any] | None = None
@@ -149,22 +155,15 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         """
         if self.render_mode is None or self.state is None:
             return None
-        import mujoco
-
-        model: Any = self.vec.env.mj_model  # pyright: ignore[reportAttributeAccessIssue]
         if self._renderer is None:
-            self._renderer = mujoco.Renderer(model), mujoco.MjData(model)  # pyright: ignore
-        renderer, data = self._renderer
-        physics = self.state.simulation.pipeline_state
-        data.qpos[:], data.qvel[:] = physics.qpos[0], physics.qvel[0]
-        mujoco.mj_forward(model, data)  # pyright: ignore[reportAttributeAccessIssue]
-        renderer.update_scene(data)
-        return (renderer.render(),)
+            model = self.vec.env.mj_model  # pyright: ignore[reportAttributeAccessIssue]
+            self._renderer = Renderer(model, *_PICTURE)
+        return (self._renderer.draw(self.state.simulation.pipeline_state.qpos[0]),)
 
     def close_extras(self, **kwargs: object) -> None:
         """Forgets the environments and the renderer."""
         if self._renderer is not None:
-            self._renderer[0].close()
+            self._renderer.close()
         self._renderer = self.state = None
 
     def __getstate__(self) -> dict[str, Any]:

@@ -117,6 +117,12 @@ def stacked(parts: Iterable[Mapping[str, Any]]) -> Table:
     return table
 
 
+def has_width(bands: Table) -> bool:
+    """Returns whether a band of a table is anywhere to be seen."""
+    ends = zip(bands["low"], bands["high"], strict=True)
+    return any(None not in (low, high) and low < high for low, high in ends)
+
+
 class Chart(NamedTuple):
     """A chart, what is said of it, and what it is drawn from.
 

@@ -33,6 +33,10 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         charts.moment_line(findings),
         *solved,
     ]
+    bands = _bands(findings)
+    band = ", and its 95% bootstrap interval" * charts.has_width(bands)
+    alone = "" if len(findings.results) == 1 else "With one configuration shown, "
+    lines = f"{alone}thin lines are single seeds, from worst to best."
     yield charts.make_chart(
         findings,
         layers,
@@ -40,13 +44,11 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         name="curves",
         title="Learning curves",
         caption=(
-            "The interquartile mean over seeds of the return without exploration, and its 95% "
-            "bootstrap interval. With one configuration shown, thin lines are single seeds, from "
-            "worst to best. The dotted line is the time of the slider below. Point at a curve to "
-            f"read it.{beyond}"
+            f"The interquartile mean over seeds of the return without exploration{band}. "
+            f"{lines[0].upper()}{lines[1:]} Point at a curve to read it.{beyond}"
         ),
-        alt="Return over env steps, a line and a band for each configuration that is shown.",
-        data={"curves": _bands(findings), "seeds": _seeds(findings)},
+        alt="Return over env steps, a line for each configuration that is shown.",
+        data={"curves": bands, "seeds": _seeds(findings)},
         listed="curves",
     )
 

@@ -16,7 +16,14 @@ _BARS = 36
 
 def draw(findings: Findings) -> Iterator[charts.Chart]:
     """Yields the chart."""
-    borders = _borders(findings)
+    borders, several = _borders(findings), len(findings.results) > 1
+    slider = len(charts.slider_stops(findings)) > 1
+    earlier = ", and where a configuration ended earlier," * several
+    when = (
+        " at the slider's time. Before its end, a dotted line marks that time in the curves. "
+        f"At its end{earlier} they show"
+    )
+    rows = " The tallest bar of each row has the same height." * several
     yield charts.make_chart(
         findings,
         [_labels(), _bars(findings, borders)],
@@ -24,10 +31,8 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         name="distribution",
         title="Where the seeds are",
         caption=(
-            "Histograms of all seeds' returns at the slider's time. At its end, and where a "
-            "configuration ended earlier, they show each seed's last evaluation, as in table 1. "
-            "The tallest bar of each row has the same height. The outermost bars include what "
-            "lies beyond them."
+            f"Histograms of all seeds' returns{when if slider else ':'} each seed's last "
+            f"evaluation, as in table 1.{rows} The outermost bars include what lies beyond them."
         ),
         alt="A histogram of returns for each configuration shown, with its median and worst.",
         data=_histograms(findings, borders),

@@ -19,6 +19,7 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
     places = list(range(len(results)))
     finals = np.concatenate([each.final for each in results])
     tenths = np.transpose([np.quantile(each.scores, [0.1, 0.9]) for each in results])
+    thick = ", thick lines their 95% intervals" * findings.intervals
     yield charts.make_chart(
         findings,
         [_rows(findings), *charts.threshold_line(findings, "x", finals)],
@@ -26,8 +27,8 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         name="final",
         title="The final return",
         caption=(
-            "Points are means over seeds, thick lines their 95% intervals, and pale bars the "
-            "middle eight tenths of the seeds."
+            f"Points are means over seeds{thick}, and pale bars the middle eight tenths of the "
+            "seeds."
         ),
         alt=(
             f"{counted(len(results), 'row')}, best first. The best, {best.configuration.label}, is "

@@ -16,6 +16,8 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
     """Yields the chart; none where no seed solved the task."""
     if not any(each.solving and each.solving.ever for each in findings.results):
         return
+    shares = _shares(findings)
+    band = ", with its pointwise 95% interval" * charts.has_width(shares)
     yield charts.make_chart(
         findings,
         [_bands_and_lines(findings), charts.moment_line(findings)],
@@ -24,12 +26,12 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         title="How many have solved it",
         caption=(
             f"The share of seeds that have reached {number(findings.experiment.threshold or 0.0)} "
-            "at least once, after Kaplan and Meier, with its pointwise 95% interval. A seed that "
-            "fell back later still counts here; table 1 says how many did. The curve's last "
-            "point is the end of each seed's training."
+            f"at least once, after Kaplan and Meier{band}. A seed that fell back later still "
+            "counts here; table 1 says how many did. The curve's last point is the end of each "
+            "seed's training."
         ),
         alt="Share of seeds over env steps, a rising line for each configuration shown.",
-        data={"solved": _shares(findings)},
+        data={"solved": shares},
         listed="solved",
     )
 

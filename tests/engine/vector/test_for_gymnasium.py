@@ -6,6 +6,7 @@ import sys
 
 import gymnasium
 import jax
+import mujoco
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
@@ -219,17 +220,50 @@ def test_torch_tensors_are_not_copied():
     assert observation.data_ptr() == env.state.obs.unsafe_buffer_pointer()
 
 
+#: Pictures of a pendulum, which moves, and of a cheetah 30 checkers on; the renderer is left open.
+RENDERED = """
+import types
+import numpy as np
+from mjx_reinforce import gym
+env = gym.make("InvertedPendulum-v5", 2, render_mode="rgb_array")
+assert env.render() is None
+env.reset(seed=0)
+(picture,) = env.render()
+assert picture.shape == (240, 320, 3)
+for _ in range(8):
+    env.step(np.full((2, 1), 3.0))
+assert np.any(env.render()[0] != picture)
+env.close()
+env = gym.make("HalfCheetah-v5", 2, render_mode="rgb_array")
+pictures = []
+for x in (0.0, 30 * 80 / 60):
+    qpos = env.vec.env.mj_model.qpos0[None].copy()
+    qpos[0, 0] = x
+    there = types.SimpleNamespace(pipeline_state=types.SimpleNamespace(qpos=qpos))
+    env.state = types.SimpleNamespace(simulation=there)
+    pictures.append(env.render()[0].astype(int))
+print(np.abs(pictures[0] - pictures[1]).mean(), pictures[0].std())
+"""
+
+
+@pytest.mark.slow
 def test_rendered():
-    env = gymnasium.make_vec("mjx_reinforce/InvertedPendulum-v5", 2, render_mode="rgb_array")
-    env.reset(seed=0)
-    try:
-        (picture,) = env.render()
-    except Exception as error:  # MuJoCo raises what its OpenGL raises
-        pytest.skip(f"no OpenGL here: {error}")
-    assert picture.shape == (240, 320, 3)
-    for _ in range(8):
-        env.step(np.full((2, 1), 3.0))
-    assert np.any(env.render()[0] != picture)
+    """In its own process, which draws without a screen; the picture goes with the robot."""
+    command = [sys.executable, "-c", RENDERED]
+    ran = subprocess.run(command, check=True, capture_output=True, text=True)
+    apart, spread = map(float, ran.stdout.split())
+    assert apart < 2
+    assert spread > 30
+    assert ran.stderr == ""
+
+
+def test_a_computer_that_cannot_draw_is_answered_at_once(monkeypatch):
+    def fail(*arguments):
+        raise RuntimeError("an OpenGL platform library has not been loaded")
+
+    monkeypatch.setattr(mujoco, "Renderer", fail)
+    with pytest.raises(ValueError, match=r"MuJoCo cannot draw .* set MUJOCO_GL=egl,"):
+        gym.make("InvertedPendulum-v5", 2, render_mode="rgb_array")
 
 
 def test_seeds_of_64_bits(cart):

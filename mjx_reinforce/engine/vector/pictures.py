@@ -1,0 +1,139 @@
+"""MuJoCo's pictures of a model at positions of its joints."""
+
+import copy
+import ctypes.util
+import os
+import sys
+import warnings
+import weakref
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from mjx_reinforce.engine.base import MjModel
+
+#: A floor's normal points upward by this much at least, [0, 1]: slopes of up to 60 degrees.
+_UPWARD = 0.5
+
+
+class Renderer:
+    """Draws a model at given positions, through its camera "track" if it has one.
+
+    Otherwise the picture goes with the robot, the body of the first joint, if nothing ties that to
+    its place. Below a robot that goes, floors have no end.
+    """
+
+    def __init__(self, model: "MjModel", width: int, height: int):
+        """Opens MuJoCo's renderer for pictures of so many pixels; see ``check_drawing``."""
+        mujoco = import_mujoco()
+        # A picture needs other sizes and lights than its model, which is left as it is.
+        model = copy.copy(model)
+        model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
+        model.vis.global_.offheight = max(model.vis.global_.offheight, height)
+        model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.4, 0.6
+        # Without a GPU smooth edges take half the time of a picture, and show no better in it.
+        model.vis.quality.offsamples = 0
+        # Without a GPU a fine shadow takes half the time of a picture, and shows no better in it.
+        model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, max(width, height))
+        self._robot, self._camera = _traveler(model), _camera(model)
+        extended = self._robot is not None and _lay_endless_floors(model)
+        self._model, self._data = model, mujoco.MjData(model)
+        self._renderer = mujoco.Renderer(model, height, width)
+        if extended:  # without a white line at the horizon, which nobody asked for
+            self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = False
+        # Without this it closes itself when Python ends, too late for its own modules.
+        self.close = weakref.finalize(self, self._renderer.close)
+
+    def draw(self, qpos: np.ndarray) -> np.ndarray:
+        """Returns a picture [height, width, 3] uint8.
+
+        Args:
+          qpos: [nq] generalized positions.
+        """
+        mujoco, model, data = import_mujoco(), self._model, self._data
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+        if self._robot is not None:
+            place = data.subtree_com[self._robot]
+            if self._camera.type == mujoco.mjtCamera.mjCAMERA_FREE:
+                self._camera.lookat[:] = place
+            # Where a sun is decides only how far its shadows reach.
+            suns = model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+            data.light_xpos[suns, :2] += place[:2]
+        # MuJoCo lays an endless floor around the camera of the scene before, which may be far away.
+        mujoco.mjv_updateCamera(model, data, self._camera, self._renderer.scene)
+        self._renderer.update_scene(data, self._camera)
+        return self._renderer.render()
+
+
+def _traveler(model: "MjModel") -> int | None:
+    """Returns the body of the first joint, the robot, if nothing ties it to its place.
+
+    What lies about comes later in a model.
+    """
+    mujoco = import_mujoco()
+    robot = model.jnt_bodyid[0] if model.njnt else -1
+    ways = (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE) | (
+        (model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & (model.jnt_limited == 0)
+    )
+    return int(robot) if ways[model.jnt_bodyid == robot].any() else None
+
+
+def _camera(model: "MjModel") -> Any:
+    """Returns an ``MjvCamera``: the model's "track", or one that looks at all of it."""
+    mujoco = import_mujoco()
+    camera = mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    for number in range(model.ncam):
+        if model.camera(number).name == "track":
+            camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, number
+    return camera
+
+
+def _lay_endless_floors(model: "MjModel") -> bool:
+    """Takes the ends off a model's floors, as contacts know none, and returns whether any had some.
+
+    A floor is a plane of the world that faces upward. Its texture keeps its scale.
+    """
+    mujoco = import_mujoco()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    planes = (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (model.geom_size[:, :2] > 0).any(1)
+    of_the_world = model.body_weldid[model.geom_bodyid] == 0
+    floors = planes & of_the_world & (data.geom_xmat[:, 8] > _UPWARD)
+    if not floors.any():
+        return False
+    textured = floors & (model.geom_matid >= 0)
+    materials, first = np.unique(model.geom_matid[textured], return_index=True)
+    sizes = model.geom_size[textured][first, :2]
+    # A texture is repeated so often from side to side, or, without sides, every two meters.
+    by_size = ~model.mat_texuniform[materials]
+    model.mat_texrepeat[materials[by_size]] /= np.where(sizes > 0, sizes, 1)[by_size]
+    model.geom_size[floors, :2] = 0
+    model.vis.headlight.specular[:] = 0  # an endless floor is of large pieces that would flash
+    return True
+
+
+def import_mujoco() -> Any:
+    """Returns MuJoCo; without a screen it is told to draw through EGL, where that is installed."""
+    unseen = not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL")
+    if unseen and "mujoco" not in sys.modules:  # where it asks, once
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    import mujoco
+
+    return mujoco
+
+
+def check_drawing() -> None:
+    """Raises ValueError, with what to do, where MuJoCo cannot draw; it takes a moment."""
+    try:
+        with warnings.catch_warnings(action="ignore"):  # GLFW's, before it fails
+            mujoco = import_mujoco()
+            mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
+    except Exception as error:  # each of MuJoCo's backends has its own
+        how = f"with MUJOCO_GL={chosen}" if (chosen := os.environ.get("MUJOCO_GL")) else "here"
+        raise ValueError(
+            f"MuJoCo cannot draw {how} ({error}); set MUJOCO_GL=egl, or MUJOCO_GL=osmesa without a "
+            "GPU, and install what is missing (Debian: apt install libegl1 libosmesa6)"
+        ) from error
