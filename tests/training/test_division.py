@@ -63,6 +63,7 @@ def test_devices_change_nothing_but_rounding(tmp_path, name):
     ],
 )
 def test_what_is_divided(monkeypatch, seeds, episodes, here, backend, expected):
+    monkeypatch.setattr(jax, "__version__", "0.10.2")
     monkeypatch.setattr(jax, "local_device_count", lambda: here)
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     config = Config(num_seeds=seeds, num_episodes=episodes)
