@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 #: What a kill leaves of the first file of a run or a sweep, which then was not begun.
 _FIRST = (".config.json.", ".sweep.json.")
 #: What the system says where no room is left, on the disk or of what this user may have of it.
-_FULL = (errno.ENOSPC, errno.EDQUOT)
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 #: A disk with less room (bytes) is full: the files of a small run take about as much.
 _ROOM = 2**20
 
@@ -196,6 +196,7 @@ def perform(
             from mjx_reinforce.runs.conduct import conduct
             from mjx_reinforce.runs.plan import describe, prepare
             from mjx_reinforce.runs.saving import RunFiles, SweepFiles
+            from mjx_reinforce.store.compile_times import describe_compiling
         except MemoryError as error:
             raise ImportError(f"no memory is left {error}".strip()) from error
 
@@ -204,6 +205,7 @@ def perform(
         with display.console.status("writing the simulation out"):
             prepared = prepare(design, known, env, display.say)
         display.say(describe(prepared))
+        display.say(describe_compiling(first, design.over))
         with display:
             kind = SweepFiles if design.over else RunFiles
             written = None if directory is None else kind(directory, prepared, display.say)

@@ -56,10 +56,12 @@ class Stopwatch:
     """Where the time goes (s).
 
     began: when
+    computed: by all threads of this process before that
     compiling: with nothing trained beside it
     """
 
     began: float = dataclasses.field(default_factory=time.perf_counter)
+    computed: float = dataclasses.field(default_factory=time.process_time)
     compiling: float = 0.0
 
     def running(self) -> float:
