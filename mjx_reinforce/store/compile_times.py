@@ -5,9 +5,11 @@ import hashlib
 import json
 from collections.abc import Iterable
 
+import jax
+
 from mjx_reinforce.engine.cache import Cache
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.store.provenance import provenance
+from mjx_reinforce.settings.defaults import num_cores
 
 #: What decides how long they take, of the settings.
 _DECISIVE = ("env", "env_set", "algorithm", "engine", "hidden_sizes", "estimator", "update")
@@ -39,7 +41,6 @@ def keep_seconds(config: Config, swept: Iterable[str], seconds: float) -> None:
 
 def _key(config: Config, swept: Iterable[str]) -> str:
     """Returns the name under which the time is kept, on this machine."""
-    made_by = provenance()
-    machine = [made_by[name] for name in ("device", "cores")]
+    machine = [jax.local_devices()[0].device_kind, num_cores()]
     known = repr([machine, *(getattr(config, name) for name in _DECISIVE), sorted(swept)])
     return f"{hashlib.sha256(known.encode()).hexdigest()}-seconds"

@@ -112,7 +112,7 @@ def test_the_flag_of_the_distribution_is_named(words):
     for command in ("train", "sweep"):
         with pytest.raises(ValueError, match="no flag is called --distribution: write --policy"):
             parse(words.split(), command)
-    with pytest.raises(ValueError, match="'distribution' after --over. Did you mean 'policy'?"):
+    with pytest.raises(ValueError, match=r"'distribution' after --over\. Did you mean 'policy'\?"):
         read_over([["distribution", "normal", "tanh-normal"]])
 
 
