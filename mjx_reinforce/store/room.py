@@ -49,19 +49,23 @@ def check_networks(
 
 
 def _of_seed(config: Config, policy: Policy, entries: int, horizon: int) -> int:
-    """Returns the bytes of one seed's networks; ``entries`` is the size of an observation."""
+    """Returns the bytes of one seed's networks; ``entries`` is the size of an observation.
+
+    Of other algorithms than ``reinforce`` it counts what any keeps, the parameters.
+    """
     leaves = jax.tree.leaves(jax.eval_shape(policy.init, jax.random.key(0)))
     weights = _FLOAT * sum(math.prod(x.shape) for x in leaves)
-    if not Reader.GRADIENT.holds(config):  # a search keeps and changes the parameters alone
-        return (_DEVICE_STATES + _HOST_STATES) * weights
-    natural = config.update == "natural-gradient"
-    states = (_SGD if natural or config.optimizer == "sgd" else _ADAM) * weights
-    passing = weights * (1 + num_noise_episodes(config.num_episodes) + _SOLVER * natural)
-    units = sum(config.hidden_sizes)
+    value = 0
     if Reader.VALUE_BASELINE.holds(config):
-        sizes = entries + 1, *config.value_hidden_sizes, 1  # the time too
+        sizes = entries + 1, *config.value_hidden_sizes, 1  # it sees the time too
         value = _FLOAT * sum((x + 1) * y for x, y in itertools.pairwise(sizes))
-        states, passing = states + _ADAM * value, passing + value
-    samples = config.num_episodes * chunk_length(horizon, config.num_episodes)
+    states, passing = weights + value, 0
+    if config.algorithm == "reinforce":
+        natural = config.update == "natural-gradient"
+        adam = config.optimizer == "adam" and not natural
+        states = (_ADAM if adam else _SGD) * weights + _ADAM * value
+        vectors = 1 + num_noise_episodes(config.num_episodes) + _SOLVER * natural
+        samples = config.num_episodes * chunk_length(horizon, config.num_episodes)
+        passing = vectors * weights + value + _FLOAT * samples * sum(config.hidden_sizes)
     host = _HOST_STATES * states + weights if jax.default_backend() == "cpu" else 0
-    return _DEVICE_STATES * states + passing + _FLOAT * samples * units + host
+    return _DEVICE_STATES * states + passing + host
