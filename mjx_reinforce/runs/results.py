@@ -238,6 +238,7 @@ def sweep(
     """
     base = _beginning("base", base, output)
     check_swept(over)
+    over = {name.replace("-", "_"): values for name, values in over.items()}  # as --over has them
     with contextlib.ExitStack() as held:
         place = asked = base.output
         if place is None:

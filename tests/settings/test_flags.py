@@ -8,6 +8,7 @@ from typing import Literal
 import pytest
 
 from mjx_reinforce.export import run_files
+from mjx_reinforce.report import ReportSettings
 from mjx_reinforce.runs import results
 from mjx_reinforce.runs.command_line import parse
 from mjx_reinforce.runs.design import read_over
@@ -120,6 +121,8 @@ def test_home_is_home_in_every_place_of_a_path(monkeypatch, tmp_path):
     """A shell leaves ``--output=~/run`` as it is, and Python does."""
     monkeypatch.setenv("HOME", str(tmp_path))
     assert read("--place=~/a").group.place == tmp_path / "a"
+    sources = read_command_line(ReportSettings, ["~/a", "~/b"], "prog").sources
+    assert sources == (tmp_path / "a", tmp_path / "b")
     assert parse(["--output=~/a"]).base.output == tmp_path / "a"
     for output in ("~/a", Path("~/a")):
         assert results._beginning("config", Config(), output).output == tmp_path / "a"
@@ -127,6 +130,20 @@ def test_home_is_home_in_every_place_of_a_path(monkeypatch, tmp_path):
     for call in (lambda: parse(["--resume", "~/a"]), lambda: run_files.read_run("~/a")):
         with pytest.raises(ValueError, match=str(tmp_path / "a")):
             call()
+
+
+def test_python_and_the_command_line_sweep_over_the_same_names(monkeypatch):
+    seen = []
+
+    def stop(design, *_, **__):
+        seen.append(dict(design.over))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(results, "perform", stop)
+    for name in ("learning-rate", "learning_rate"):
+        with pytest.raises(KeyboardInterrupt):
+            results.sweep(Config(), {name: [0.1, 0.2]})
+        assert seen.pop() == read_over([[name, "0.1", "0.2"]]) == {"learning_rate": [0.1, 0.2]}
 
 
 def test_the_help_shows_every_setting(capsys, monkeypatch):
