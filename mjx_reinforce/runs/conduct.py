@@ -51,7 +51,8 @@ def conduct(
     clock.compiling = time.perf_counter() - clock.began
     # Where others compute beside this, what it computed itself is nearer to a quiet machine's time.
     quiet = min(clock.compiling, time.process_time() - clock.computed)
-    keep_seconds(prepared.design.configs[0], prepared.design.over, quiet)
+    if any(part.chunks for part in left):
+        keep_seconds(prepared.design.configs[0], prepared.design.over, quiet)
     # Not before: a kill while it compiles leaves nothing that would refuse the next.
     interrupt.defer(display.say)
     for each in written:
