@@ -238,7 +238,7 @@ def test_the_remedy_is_that_of_what_keeps_the_files_away(
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(perform.tempfile, "TemporaryFile", full)
-    assert run(*COMMON, "--output", "new/out") == 2
+    assert run(*COMMON, "--max-updates", 4, "--output", "new/out") == 2
     assert f"({os.strerror(number)}); {remedy}" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
