@@ -66,6 +66,11 @@ def _choose_cache() -> None:
         )
         chosen = None
         compilation_cache.reset_cache()  # a module of the user's may have used it
+    elif chosen and "://" not in chosen and not os.access(chosen, os.W_OK):
+        warn(
+            f"nothing can be kept in the cache {chosen} (it cannot be written), so the next start "
+            f"compiles again what is not there; set {variable} to a folder of your own"
+        )
     jax.config.update("jax_compilation_cache_dir", chosen)
 
 

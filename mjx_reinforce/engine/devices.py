@@ -8,6 +8,7 @@ from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from mjx_reinforce.engine.base import PyTree
+from mjx_reinforce.engine.memory import gigabytes, host_memory
 
 _AXIS = "devices"
 #: XLA tries kernels for each product of matrices until it has the fastest, and which it takes may
@@ -15,6 +16,24 @@ _AXIS = "devices"
 _ON_GPU = {"xla_gpu_enable_triton_gemm": False, "xla_gpu_autotune_level": 0}
 #: The first axis is divided among the devices, such as that of the runs; the second is; none is.
 RUNS, SECOND, NONE = PartitionSpec(_AXIS), PartitionSpec(None, _AXIS), PartitionSpec()
+
+
+def memory_here() -> float:
+    """Returns the memory that a device has for arrays (bytes); on a CPU it is the host's."""
+    device = jax.local_devices()[0]
+    if device.platform == "cpu":
+        return host_memory()
+    return float((device.memory_stats() or {}).get("bytes_limit", float("inf")))
+
+
+def check_room(needed: float) -> None:
+    """Raises ValueError if so many bytes are not there."""
+    if needed > (here := memory_here()):
+        raise ValueError(
+            f"this does not fit into memory: it needs about {gigabytes(needed)}, "
+            f"{gigabytes(here)} are here; lower --num-seeds (of a sweep --chunk-runs), "
+            "--num-episodes, --eval-episodes, --hidden-sizes, --value-hidden-sizes or --horizon"
+        )
 
 
 def executable(lowered: jax.stages.Lowered) -> jax.stages.Compiled:

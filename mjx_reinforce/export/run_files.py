@@ -4,6 +4,7 @@ The package has a folder of NumPy files and JSON for each task with a trained po
 ``python -m experiments.studies.results pretrained DIR`` writes.
 """
 
+import os
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -59,7 +60,7 @@ def read_run(directory: str | Path) -> Run:
     Raises:
       ValueError: it is not a run directory, or it has no policy yet.
     """
-    directory = Path(directory)
+    directory = Path(os.path.expanduser(directory))
     if str(directory) in pretrained() and not directory.exists():
         name, facts = str(directory), provenance_of(str(directory))
         return Run(FOLDER / name, name, facts["horizon"], (facts["seed"],), packaged=True)

@@ -17,6 +17,7 @@ from jax.flatten_util import ravel_pytree
 from mjx_reinforce.engine.base import Environment, Trajectory, action_space, observation_size
 from mjx_reinforce.engine.checks import check_count, check_key, check_kind, check_number
 from mjx_reinforce.engine.contract import check_environment
+from mjx_reinforce.engine.devices import check_room
 from mjx_reinforce.engine.play import choice
 from mjx_reinforce.engine.play.choice import Engine, Rollout
 from mjx_reinforce.engine.play.episode import check_each, episode_keys
@@ -174,7 +175,8 @@ def reinforce(
       engine: how episodes are played: "auto", "vmap" or "native", see ``engine.play.choice``.
 
     Raises:
-      ValueError: an argument makes no sense for this environment.
+      ValueError: an argument makes no sense for this environment, or the policy does not fit into
+        memory.
 
     Examples:
       >>> import jax
@@ -206,6 +208,8 @@ def reinforce(
     contract.check_estimator(estimator, env, size, num_episodes)
 
     example = jax.eval_shape(functools.partial(first_actor, policy, size), jax.random.key(0))
+    # The parameters, their gradient, and what they become.
+    check_room(3.0 * sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(example)))
     acting = choice.ActingPolicy(functools.partial(act, policy), example, policy.distribution)
     parts = _Reinforce(
         env=env,

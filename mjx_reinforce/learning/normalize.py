@@ -9,6 +9,8 @@ from mjx_reinforce.engine.base import Trajectory
 #: Scaled observations are clipped to plus or minus this many standard deviations.
 CLIP = 10.0
 _LEAST_STD = 1e-4
+#: Whole numbers are exact in float32 up to this.
+_EXACT = 2**24
 
 
 class Normalizer(struct.PyTreeNode, kw_only=True):
@@ -64,7 +66,14 @@ def update(
     m2 = jnp.sum(jnp.where(kept, (observation - mean) ** 2, 0.0), axis=(0, 1))
     total = jnp.maximum(normalizer.count + count, 1.0)
     delta = mean - normalizer.mean
+    before = normalizer.m2 / jnp.maximum(normalizer.count, 1.0)
+    # What a count of this size is rounded by would tell in the ratio of two long sums: a batch then
+    # moves the variance by the share that it has in the count as it is kept.
+    share = (normalizer.count + count - normalizer.count) / total
+    apart = m2 / divisor + delta**2 * normalizer.count / total - before
+    moved = (before + share * apart) * total
     m2 = normalizer.m2 + m2 + delta**2 * normalizer.count * count / total
+    m2 = jnp.where(total > _EXACT, moved, m2)
     return Normalizer(
         count=normalizer.count + count,
         mean=normalizer.mean + delta * count / total,

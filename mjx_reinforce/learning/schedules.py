@@ -83,7 +83,10 @@ def share(clock: Clock, env_steps: float | jax.Array | None) -> jax.Array:
       clock: of the run.
       env_steps: the schedule's length; None is as long as the budget.
     """
-    passed = clock.progress if env_steps is None else clock.env_steps / env_steps
+    if env_steps is None:
+        return jnp.minimum(clock.progress, 1.0)
+    # An int beyond 2^31 would not fit into JAX's.
+    passed = clock.env_steps / jnp.asarray(env_steps, clock.env_steps.dtype)
     return jnp.minimum(passed, 1.0)
 
 

@@ -106,7 +106,7 @@ def whole_rollout(turn: Turn) -> Update:
 def _signal_to_noise(problem: Problem, params: Params, grads: Params) -> jax.Array:
     """Returns the signal-to-noise ratio [] of the gradients summed over all episodes."""
     num_episodes = problem.samples[-1].shape[1]
-    few = min(max(1, num_episodes // _NOISE_SHARE), _NOISE_EPISODES)
+    few = num_noise_episodes(num_episodes)
 
     def alone(episode):
         samples = jax.tree.map(lambda x: x[:, None], episode)
@@ -115,6 +115,11 @@ def _signal_to_noise(problem: Problem, params: Params, grads: Params) -> jax.Arr
     each = jax.vmap(alone, in_axes=1)(jax.tree.map(lambda x: x[:, :few], problem.samples))
     mean = jax.tree.map(lambda g: g / num_episodes, grads)
     return signal_to_noise(mean, each, num_episodes)
+
+
+def num_noise_episodes(num_episodes: int) -> int:
+    """Returns from how many of these episodes the gradient's noise is estimated."""
+    return min(max(1, num_episodes // _NOISE_SHARE), _NOISE_EPISODES)
 
 
 def descend(
@@ -261,10 +266,15 @@ def draw_steps(key: jax.Array, mask: jax.Array, shape: tuple[int, ...]) -> jax.A
 def in_chunks(data: tuple[Any, ...]) -> tuple[tuple[Any, ...], jax.Array]:
     """Returns the data [C, length, N, ...], and which of the C chunks have a step to visit."""
     horizon, num_episodes = data[-1].shape
-    samples = MAX_SAMPLES * (1 if jax.default_backend() == "cpu" else GPU_FACTOR)
-    length = largest_divisor(horizon, min(MAX_STEPS, max(1, samples // num_episodes)))
+    length = chunk_length(horizon, num_episodes)
     chunks = jax.tree.map(lambda x: x.reshape(horizon // length, length, *x.shape[1:]), data)
     return chunks, jnp.any(chunks[-1], axis=(1, 2))
+
+
+def chunk_length(horizon: int, num_episodes: int) -> int:
+    """Returns how many steps of all episodes are visited at once."""
+    samples = MAX_SAMPLES * (1 if jax.default_backend() == "cpu" else GPU_FACTOR)
+    return largest_divisor(horizon, min(MAX_STEPS, max(1, samples // num_episodes)))
 
 
 def chunk_at(chunks: tuple[Any, ...], index: jax.Array) -> tuple[Any, ...]:

@@ -259,7 +259,8 @@ def _moments(
     """
     steps = jnp.sum(mask)
     updates = critic.updates + (steps > 0)
-    share = jnp.where(steps > 0, jnp.maximum(1 / jnp.maximum(updates, 1), _UPDATE_SHARE), 0.0)
+    counted = jnp.maximum(updates.astype(jnp.uint32), 1)  # beyond 2^31 an int32 is negative
+    share = jnp.where(steps > 0, jnp.maximum(1 / counted, _UPDATE_SHARE), 0.0)
 
     def mean(x):
         return jnp.sum(jnp.where(mask, x, 0.0)) / jnp.maximum(steps, 1)

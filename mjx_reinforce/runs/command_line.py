@@ -2,6 +2,7 @@
 
 import dataclasses
 import gc
+import os
 import shlex
 import sys
 import traceback
@@ -132,10 +133,11 @@ def _default(arguments: Sequence[str]) -> Config:
     """Returns the settings that hold where the user gives none: a task's, or those of a run."""
     if not (like := flag_value(arguments, "--like")):
         return for_arguments(arguments)
-    if not (Path(like) / "config.json").is_file():
+    directory = Path(os.path.expanduser(like))
+    if not (directory / "config.json").is_file():
         raise ValueError(f"--like {like}: there is no run, for it has no config.json")
-    known = read_design(Path(like)).base
-    check_named(vars(known), named_code(arguments), Path(like))
+    known = read_design(directory).base
+    check_named(vars(known), named_code(arguments), directory)
     return dataclasses.replace(known, resume=None)
 
 

@@ -194,7 +194,10 @@ def _of_env(name: str) -> str | None:
 
 def _unknown(word: str) -> str:
     """Returns the message about a word that is no setting."""
-    near = nearest(word, [spoken(name) for name in _FIELDS])
+    if word == "distribution":
+        near: str | None = "policy"
+    else:
+        near = nearest(word, [spoken(name) for name in _FIELDS])
     hint = f" Did you mean {near!r}?" if near else ""
     return f"unknown setting {word!r} after --over.{hint} (--help lists the settings.)"
 

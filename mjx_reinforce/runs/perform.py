@@ -4,6 +4,7 @@ Its directory is made, tried and locked before anything heavy is imported.
 """
 
 import contextlib
+import errno
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 #: What a kill leaves of the first file of a run or a sweep, which then was not begun.
 _FIRST = (".config.json.", ".sweep.json.")
+#: What the system says where no room is left, on the disk or of what this user may have of it.
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 #: A disk with less room (bytes) is full: the files of a small run take about as much.
 _ROOM = 2**20
 
@@ -104,7 +107,9 @@ def own_directory(directory: Path, interrupt: Interrupt, *, resumed: bool) -> It
                 _check_unbegun(directory)  # not before: another may have been quicker
         except OSError as error:
             remove_empty(made)
-            remedy = "make room there" + ("" if resumed else ", or choose another --output")
+            full = error.errno in _FULL
+            remedy = "make room there" if full else "make it a folder that you may write to"
+            remedy += "" if resumed else ", or choose another --output"
             raise ValueError(
                 f"cannot write to the run directory {directory} ({error.strerror}); {remedy}"
             ) from error
@@ -192,6 +197,7 @@ def perform(
             from mjx_reinforce.runs.conduct import conduct
             from mjx_reinforce.runs.plan import describe, prepare
             from mjx_reinforce.runs.saving import RunFiles, SweepFiles
+            from mjx_reinforce.store.compile_times import describe_compiling
         except MemoryError as error:
             raise ImportError(f"no memory is left {error}".strip()) from error
 
@@ -202,6 +208,7 @@ def perform(
         with display.console.status("writing the simulation out"):
             prepared = prepare(design, known, env, display.say)
         display.say(describe(prepared))
+        display.say(describe_compiling(first, design.over))
         with display:
             kind = SweepFiles if design.over else RunFiles
             written = None if directory is None else kind(directory, prepared, display.say)

@@ -128,6 +128,9 @@ def prepare(
 #: Episodes are divided among GPUs only where each plays so many of an update, of all seeds: fewer
 #: take as long as these. Devices of a CPU are there because the user made them.
 _LEAST = 1024
+#: XLA of this JAX ends the process on a CPU's devices as it divides arrays without entries, such as
+#: the constants of a categorical policy. Where whole seeds are divided it has none to divide.
+_DIVIDES_NO_EPISODES = "0.11.2"
 
 
 def divide_run(config: Config) -> Division:
@@ -139,11 +142,14 @@ def divide_run(config: Config) -> Division:
     here, num_seeds = jax.local_device_count(), config.num_seeds
     width = -(-num_seeds // here)
     by_seeds = Division(seeds=-(-num_seeds // width))
+    on_cpu = jax.default_backend() == "cpu"
+    if on_cpu and jax.__version__ == _DIVIDES_NO_EPISODES:
+        return by_seeds
     if find_algorithm(config.algorithm).search_episodes or is_own(config.algorithm):
         return by_seeds
     episodes = max(n for n in range(1, here + 1) if config.num_episodes % n == 0)
     each = num_seeds * config.episodes_per_update / episodes
-    enough = each >= _LEAST or jax.default_backend() == "cpu"
+    enough = each >= _LEAST or on_cpu
     # How many seeds' episodes a device plays, by either.
     return Division(episodes=episodes) if enough and num_seeds / episodes < width else by_seeds
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -237,6 +238,7 @@ def sweep(
     """
     base = _beginning("base", base, output)
     check_swept(over)
+    over = {name.replace("-", "_"): values for name, values in over.items()}  # as --over has them
     with contextlib.ExitStack() as held:
         place = asked = base.output
         if place is None:
@@ -261,7 +263,9 @@ def _beginning(name: str, config: Config, output: Path | str | None) -> Config:
             f"this begins anew: python -m mjx_reinforce.train --resume {directory} goes on with "
             "what is there"
         )
-    return config if output is None else dataclasses.replace(config, output=Path(output))
+    place = config.output if output is None else output
+    place = None if place is None else Path(os.path.expanduser(place))
+    return dataclasses.replace(config, output=place)
 
 
 def read_results(directory: Path) -> SweepResults:

@@ -1,9 +1,12 @@
 """Reading a command line, and refusing in one line."""
 
 import dataclasses
+import functools
+import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -14,28 +17,53 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import COMMANDS, command
 from mjx_reinforce.console.streams import accept_everything, say_error
-from mjx_reinforce.engine.checks import nearest, whole_number
+from mjx_reinforce.engine.checks import fits, nearest, read_as, whole_number
 from mjx_reinforce.registry import is_own
+from mjx_reinforce.settings.config import flag, marked
+from mjx_reinforce.settings.declare import Range
 from mjx_reinforce.settings.defaults import PRESETS
 
 Form = TypeVar("Form")
 
-#: How whole numbers are read, everywhere.
+#: How values are read, in every command: as ``--over`` reads them.
 _READERS = ConstructorRegistry()
+#: What is read otherwise than tyro does -> its name in --help, and how.
+_READ: dict[Any, tuple[str, Callable[[str], Any]]] = {
+    int: ("INT", whole_number),
+    type(None): ("{None}", functools.partial(read_as, type(None))),
+    Path: ("PATH", lambda word: Path(os.path.expanduser(word))),
+}
+#: Flags of layers.
+_LAYERS = [flag(name) for name in marked(Range.LAYERS)]
+#: What people call a flag that has another name.
+_OTHER_NAMES = {"--distribution": "--policy"}
 
 
 @_READERS.primitive_rule
 def _reader(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """Returns how a whole number is read, such as 1e6."""
-    if kind.type is not int:
+    """Returns how a value is read, such as the number 1e6, None in any case, or a path with ~."""
+    if kind.type not in _READ:
         return None
+    metavar, read = _READ[kind.type]
     return PrimitiveConstructorSpec(
         nargs=1,
-        metavar="INT",
-        instance_from_str=lambda words: whole_number(words[0]),
-        is_instance=lambda value: isinstance(value, int),
+        metavar=metavar,
+        instance_from_str=lambda words: read(words[0]),
+        is_instance=lambda value: fits(value, kind.type),
         str_from_instance=lambda value: [str(value)],
     )
+
+
+def _spread(arguments: Sequence[str]) -> Iterator[str]:
+    """Yields the words of a command line, layers as tyro reads them: 32,32 as 32 32, none as no."""
+    name = ""
+    for word in arguments:
+        if word.startswith("--"):
+            name = word.partition("=")[0].replace("_", "-")
+        if name in _LAYERS:
+            yield from re.sub(r"[=,]|\bnone\b", " ", word, flags=re.IGNORECASE).split()
+        else:
+            yield word
 
 
 def read_command_line(
@@ -53,13 +81,18 @@ def read_command_line(
       description: of the program, for --help; the docstring of the form if not given.
 
     Raises:
-      ValueError: a word or a value is empty, which would be read as the current folder.
+      ValueError: a word or a value is empty, which would be read as the current folder; or a flag
+        has another name here.
     """
     if any(not word or re.fullmatch("--[^=]+=", word) for word in arguments):
         raise ValueError("a value on the command line is empty; is a variable of the shell unset?")
+    for word in arguments:
+        name = word.partition("=")[0]
+        if name in _OTHER_NAMES:
+            raise ValueError(f"no flag is called {name}: write {_OTHER_NAMES[name]}")
     _give_help(form)
     options: dict[str, Any] = {"registry": _READERS, "config": (tyro.conf.OmitArgPrefixes,)}
-    return tyro.cli(form, prog=prog, description=description, args=arguments, **options)
+    return tyro.cli(form, prog=prog, description=description, args=[*_spread(arguments)], **options)
 
 
 def _give_help(form: type) -> None:

@@ -28,6 +28,7 @@ from mjx_reinforce.registry import (
     load_definition,
 )
 from mjx_reinforce.settings.config import Config
+from mjx_reinforce.store.room import check_networks
 from mjx_reinforce.training import wrappers
 
 
@@ -36,6 +37,7 @@ def build(
     config: Config,
     policy: Policy | None = None,
     devices: Devices | None = None,
+    num_seeds: int = 1,
 ) -> tuple[Learner, int]:
     """Builds the learner that the settings describe.
 
@@ -44,6 +46,7 @@ def build(
       config: the settings.
       policy: a ready policy, in place of the one that the settings describe.
       devices: among which the episodes of an update are divided, of ``reinforce`` alone.
+      num_seeds: how many a device trains at once, for whose networks there must be memory.
 
     Returns:
       The learner, and the horizon in env steps.
@@ -54,8 +57,10 @@ def build(
     check_environment(env)
     horizon = check_horizon(env, config.horizon)
     forever, described = config.normalize_steps is None, policy_settings(env, config)
+    policy = build_policy(described) if policy is None else policy
+    check_networks(env, config, policy, config.training_horizon(horizon), num_seeds)
     shared = {  # of all algorithms, the user's too
-        "policy": build_policy(described) if policy is None else policy,
+        "policy": policy,
         "horizon": config.training_horizon(horizon),
         "normalize_steps": math.inf if forever else config.normalize_steps,
         "normalize_min_std": config.normalize_min_std,

@@ -116,7 +116,8 @@ def made(
       ValueError: the settings do not fit the environment.
     """
     devices = division.devices() if division.episodes > 1 else None
-    learner, horizon = build(env, config, devices=devices)
+    width = division.width(config.num_seeds) if traced is None else 1
+    learner, horizon = build(env, config, devices=devices, num_seeds=width)
     policy, threshold = policy_settings(env, config), getattr(env, "reward_threshold", None)
 
     def build_learner(settings: dict[str, Any]) -> Learner:
@@ -131,7 +132,6 @@ def made(
 
     @functools.cache
     def programs() -> Programs:
-        width = division.width(config.num_seeds) if traced is None else 1
         return programs_of(
             *(env, build_learner, horizon, config, width, traced or ()),
             whole=traced is None,

@@ -21,8 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.engine.devices import NONE, RUNS, SECOND, executable
-from mjx_reinforce.engine.memory import gigabytes, host_memory
+from mjx_reinforce.engine.devices import NONE, RUNS, SECOND, check_room, executable
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import Config
@@ -57,10 +56,12 @@ class Stopwatch:
     """Where the time goes (s).
 
     began: when
+    computed: by all threads of this process before that
     compiling: with nothing trained beside it
     """
 
     began: float = dataclasses.field(default_factory=time.perf_counter)
+    computed: float = dataclasses.field(default_factory=time.process_time)
     compiling: float = 0.0
 
     def running(self) -> float:
@@ -314,24 +315,6 @@ def _compile_begin(programs: Programs, width: int) -> Callable[..., Any]:
     given = division.shapes((numbers, shape_of_all(programs.like, width).settings), RUNS)
     program = division.jit(programs.begin, (NONE, RUNS, RUNS), (RUNS, SECOND))
     return executable(program.lower(seed, *given))
-
-
-def memory_here() -> float:
-    """Returns the memory that a device has for arrays (bytes); on a CPU it is the host's."""
-    device = jax.local_devices()[0]
-    if device.platform == "cpu":
-        return host_memory()
-    return float((device.memory_stats() or {}).get("bytes_limit", float("inf")))
-
-
-def check_room(needed: float) -> None:
-    """Raises ValueError if so many bytes are not there."""
-    if needed > (here := memory_here()):
-        raise ValueError(
-            f"this does not fit into memory: it needs about {gigabytes(needed)}, "
-            f"{gigabytes(here)} are here; lower --num-seeds (of a sweep --chunk-runs), "
-            "--num-episodes, --eval-episodes, --hidden-sizes or --horizon"
-        )
 
 
 def check_fits(program: jax.stages.Compiled) -> None:

@@ -10,12 +10,17 @@ import jax
 import pytest
 from toys import Survive
 
+import mjx_reinforce as mr
 from mjx_reinforce import envs
+from mjx_reinforce.engine import devices
+from mjx_reinforce.engine.base import action_space
 from mjx_reinforce.engine.memory import gigabytes
+from mjx_reinforce.engine.play import choice
 from mjx_reinforce.runs import command_line, plan
 from mjx_reinforce.runs.design import Design, check_design
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import HORIZONS, MINUTES, PRESETS, of_task
+from mjx_reinforce.store import ready, room
 from mjx_reinforce.training import slots
 
 
@@ -78,13 +83,67 @@ def test_what_no_memory_holds_is_refused(settings):
         check_design(Design(base=Config(**settings)))
 
 
+WIDE = (100_000, 100_000)
+
+
+@pytest.mark.parametrize(
+    ("settings", "traced", "needed"),
+    [
+        ({"hidden_sizes": WIDE, "num_seeds": 1}, None, "600"),  # 15 times 40 GB
+        ({"hidden_sizes": WIDE, "num_seeds": 4}, (), "600"),  # of a sweep, at least one run
+        ({"value_hidden_sizes": WIDE, "estimator": "value-baseline"}, None, "2,080"),
+        ({"hidden_sizes": (2000, 2000), "num_seeds": 1000}, None, "241"),
+        ({"hidden_sizes": WIDE, "algorithm": "ars", "num_seeds": 1}, None, "200"),
+    ],
+)
+def test_networks_that_do_not_fit_into_memory_are_refused_before_anything_is_written_out(
+    monkeypatch, settings, traced, needed
+):
+    monkeypatch.setattr(devices, "memory_here", lambda: 25e9)
+    monkeypatch.setattr(choice, "choose", lambda *_: pytest.fail("an engine is made"))
+    with pytest.raises(ValueError, match=r"does not fit into memory: .*lower --num-seeds") as error:
+        ready.made(Survive(), Config(num_episodes=4, horizon=8, **settings), traced=traced)
+    assert f"it needs about {needed} GB, 25 GB are here" in str(error.value)
+
+
+@pytest.mark.slow
+@pytest.mark.cpu
+@pytest.mark.parametrize(
+    "settings", [{}, {"optimizer": "sgd"}, {"update": "natural-gradient", "max_kl": 0.01}]
+)
+def test_what_is_foretold_of_networks_is_no_more_than_xla_says(monkeypatch, settings):
+    """Nor less than a third: what XLA adds are copies."""
+    sizes = {"num_seeds": 2, "num_episodes": 64, "horizon": 8, "eval_episodes": 1}
+    config = Config(engine="vmap", hidden_sizes=(256, 256), **sizes, **settings)
+    foretold, said = [], []
+    monkeypatch.setattr(room, "_HOST_STATES", 0)
+    monkeypatch.setattr(room, "check_room", foretold.append)
+    monkeypatch.setattr(slots, "check_room", said.append)
+    slots.compile_run(ready.made(Survive(), config).programs(), config)
+    assert max(said) / 3 < foretold[0] <= max(said)
+
+
+def test_a_network_of_python_that_does_not_fit_into_memory_is_refused(monkeypatch):
+    monkeypatch.setattr(choice, "choose", lambda *_: pytest.fail("an engine is made"))
+    env = Survive()
+    policy = mr.mlp_policy(1, mr.normal(action_space(env)), (1_000_000, 1_000_000))
+    with pytest.raises(ValueError, match=r"it needs about 12,000 GB"):
+        mr.reinforce(env, policy=policy, horizon=8)
+
+
+def test_an_update_of_more_steps_than_are_counted_is_refused():
+    config = Config(num_episodes=2**20, horizon=2**11)
+    with pytest.raises(ValueError, match=r"2,147,483,648 env steps .* lower --num-episodes or"):
+        ready.made(Survive(), config)
+
+
 @pytest.mark.slow
 def test_what_does_not_fit_into_memory_is_refused_before_it_runs(
     run, tmp_path, capsys, monkeypatch
 ):
     """By what XLA says of its programs; a sweep takes narrower slots where these fit."""
     arguments = ["--env", "Survive-v0", "--eval-episodes", "2", "--num-episodes", "64"]
-    monkeypatch.setattr(slots, "memory_here", lambda: 3e4)
+    monkeypatch.setattr(devices, "memory_here", lambda: 3e4)
     assert run(*arguments, "--num-seeds", "2", "--output", "out") == 2
     assert "this does not fit into memory: it needs about 1 MB, 1 MB are" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -54,6 +54,9 @@ def test_files_and_a_screen_say_the_same(results, tmp_path, monkeypatch, capsys)
     written = mjx_reinforce.run(CONFIG, output="here")
     said = capsys.readouterr().out
     assert said.startswith("Training 2 seeds of ContinuousCartPole-v0")
+    compiling, compiled, *_ = said.splitlines()[1:]  # the first in a log before it, too
+    assert compiling.startswith("compiling, ")
+    assert compiled.startswith("compiled in ")
     assert "update     6" in said
     np.testing.assert_array_equal(written.eval_return, results.eval_return)
     saved = read_policy(tmp_path / "here" / "policy", 1)

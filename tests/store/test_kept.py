@@ -17,6 +17,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from toys import Survive
 
 from mjx_reinforce import envs
+from mjx_reinforce.console import jax_setup
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.engine import cache
 from mjx_reinforce.engine.cpu import machine, seam
@@ -24,7 +25,7 @@ from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.gpu import seam as gpu
 from mjx_reinforce.engine.play import objects
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.store import ready
+from mjx_reinforce.store import compile_times, ready
 from mjx_reinforce.training.slots import compile_run
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=4000, eval_episodes=2)
@@ -262,6 +263,33 @@ def test_a_cache_of_jax_that_does_not_work_is_named_once(tmp_path, capsys):
         assert compile_and_run() == compile_and_run()
     (said,) = capsys.readouterr().err.splitlines()
     assert said.startswith(f"warning: the cache {file} is not used (FileExistsError")
+
+
+def test_a_cache_of_jax_that_can_only_be_read_is_used_and_named(tmp_path, capsys, monkeypatch):
+    """The programs that are there serve; nothing says else that no other is kept."""
+    access = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK and access(path, mode))
+    jax_setup.warn.cache_clear()
+    with cache_of_jax(tmp_path):
+        assert jax.config.values["jax_compilation_cache_dir"] == str(tmp_path)
+    (said,) = capsys.readouterr().err.splitlines()
+    assert f"nothing can be kept in the cache {tmp_path} (it cannot be written), so the" in said
+
+
+def test_how_long_compiling_takes_is_said_before(folder, monkeypatch):
+    """At first in general, then as it was with these settings, on any seed and budget."""
+    first = compile_times.describe_compiling(CONFIG)
+    assert first.startswith("compiling, usually 5 to 40 s on a quiet machine, less where")
+    compile_times.keep_seconds(CONFIG, (), 12.4)
+    other = dataclasses.replace(CONFIG, seed=3, env_steps=10**12)
+    assert compile_times.describe_compiling(other) == "compiling, about 12 s the last time"
+    larger = dataclasses.replace(CONFIG, hidden_sizes=(999,))
+    for config, swept in ((larger, ()), (CONFIG, ("discount",))):
+        assert compile_times.describe_compiling(config, swept) == first
+    monkeypatch.setattr(objects, "folder", lambda: None)
+    assert "nothing is kept here, so the next start compiles again" in (
+        compile_times.describe_compiling(CONFIG)
+    )
 
 
 def test_a_program_that_calls_python_is_not_kept(folder):

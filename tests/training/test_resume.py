@@ -19,7 +19,7 @@ from saved_runs import assert_same, change
 from mjx_reinforce import files
 from mjx_reinforce import files as export_files
 from mjx_reinforce.engine.cpu import machine
-from mjx_reinforce.runs import plan
+from mjx_reinforce.runs import perform, plan
 from mjx_reinforce.runs.perform import locked
 from mjx_reinforce.runs.saving import RunFiles
 from mjx_reinforce.training import resume
@@ -218,6 +218,29 @@ def test_a_full_disk_is_refused_at_once(run, parts, tmp_path, monkeypatch, capsy
     assert code == 2
     assert "(File too large); make room there" in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [
+        (errno.EACCES, "make it a folder that you may write to, or choose another --output"),
+        (errno.EROFS, "make it a folder that you may write to, or choose another --output"),
+        (errno.ENOSPC, "make room there, or choose another --output"),
+        (errno.EDQUOT, "make room there, or choose another --output"),
+    ],
+)
+def test_the_remedy_is_that_of_what_keeps_the_files_away(
+    run, tmp_path, monkeypatch, capsys, number, remedy
+):
+    """It is not always room that lacks."""
+
+    def full(**_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(perform.tempfile, "TemporaryFile", full)
+    assert run(*COMMON, "--max-updates", 4, "--output", "new/out") == 2
+    assert f"({os.strerror(number)}); {remedy}" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow

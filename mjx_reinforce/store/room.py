@@ -1,0 +1,71 @@
+"""How much memory the networks of a run take: foretold, before anything is compiled.
+
+What is counted is certain to be there at one time. What XLA adds is known when it has compiled, see
+``training.slots``.
+"""
+
+import itertools
+import math
+
+import jax
+
+from mjx_reinforce.engine.base import Environment, observation_size
+from mjx_reinforce.engine.devices import check_room
+from mjx_reinforce.learning.policy import Policy
+from mjx_reinforce.learning.updates import chunk_length, num_noise_episodes
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.declare import MAX_OF_UPDATE
+from mjx_reinforce.settings.groups import Reader
+
+_FLOAT = 4
+#: Copies of the states of training while an update is made: those before it and after it on the
+#: device; on the host its own, those before the last block, and the policies alone the best.
+_DEVICE_STATES, _HOST_STATES = 2, 2
+#: What an optimizer keeps of each parameter, with the parameter itself.
+_ADAM, _SGD = 3, 1
+#: Vectors of the conjugate gradients: the solution, the residual, the direction, its product.
+_SOLVER = 4
+
+
+def check_networks(
+    env: Environment, config: Config, policy: Policy, horizon: int, num_seeds: int
+) -> None:
+    """Raises ValueError where the networks of a run cannot fit into memory.
+
+    Args:
+      env: what they see.
+      config: the settings.
+      policy: whose parameters are trained.
+      horizon: T, the time limit of a training episode in steps.
+      num_seeds: how many a device trains at once.
+    """
+    steps = config.episodes_per_update * horizon
+    if steps > MAX_OF_UPDATE:
+        raise ValueError(
+            f"an update may have {steps:,} env steps ({config.episodes_per_update:,} episodes of "
+            f"{horizon:,}), and fewer than 2^31 are counted; lower --num-episodes or --horizon"
+        )
+    check_room(num_seeds * float(_of_seed(config, policy, observation_size(env), horizon)))
+
+
+def _of_seed(config: Config, policy: Policy, entries: int, horizon: int) -> int:
+    """Returns the bytes of one seed's networks; ``entries`` is the size of an observation.
+
+    Of other algorithms than ``reinforce`` it counts what any keeps, the parameters.
+    """
+    leaves = jax.tree.leaves(jax.eval_shape(policy.init, jax.random.key(0)))
+    weights = _FLOAT * sum(math.prod(x.shape) for x in leaves)
+    value = 0
+    if Reader.VALUE_BASELINE.holds(config):
+        sizes = entries + 1, *config.value_hidden_sizes, 1  # it sees the time too
+        value = _FLOAT * sum((x + 1) * y for x, y in itertools.pairwise(sizes))
+    states, passing = weights + value, 0
+    if config.algorithm == "reinforce":
+        natural = config.update == "natural-gradient"
+        adam = config.optimizer == "adam" and not natural
+        states = (_ADAM if adam else _SGD) * weights + _ADAM * value
+        vectors = 1 + num_noise_episodes(config.num_episodes) + _SOLVER * natural
+        samples = config.num_episodes * chunk_length(horizon, config.num_episodes)
+        passing = vectors * weights + value + _FLOAT * samples * sum(config.hidden_sizes)
+    host = _HOST_STATES * states + weights if jax.default_backend() == "cpu" else 0
+    return _DEVICE_STATES * states + passing + host
