@@ -35,7 +35,7 @@ from mjx_reinforce.files import (
 )
 from mjx_reinforce.learning import normalize
 from mjx_reinforce.learning.distributions import Distribution
-from mjx_reinforce.learning.policy import Actor, Policy, act, mlp_policy
+from mjx_reinforce.learning.policy import Actor, Policy, act, mlp_policy, within_bounds
 from mjx_reinforce.registry import DISTRIBUTIONS, check_choice, is_own, load_choice
 
 #: The name in the archive of what says that it belongs to the settings beside it.
@@ -47,7 +47,7 @@ _FAMILY_ARGUMENTS = {"initial_std": None, "rescale": True}
 class SavedPolicy(NamedTuple):
     """What a ``policy`` folder holds.
 
-    policy: the policy
+    policy: the policy; its mode is clipped to the action space
     actor: of one seed, or of all, stacked [S, ...]
     settings: what ``policy`` was built from, see ``save_policy``
     num_seeds: S, how many seeds the folder holds
@@ -157,7 +157,7 @@ def read_policy(
             f"mjx_reinforce.load(..., policy={settings['policy']!r})"
         )
     with naming_damage(settings_path):
-        policy = build_policy(settings)
+        policy = played_policy(settings)
     num_seeds = len(arrays["normalizer/count"])
     if seed is not None and not 0 <= seed < num_seeds:
         seeds = f"its seeds are 0 to {num_seeds - 1}" if num_seeds > 1 else "it has seed 0 alone"
@@ -210,6 +210,8 @@ def build_policy(settings: dict[str, Any]) -> Policy:
     family = settings["policy"]
     make = load_choice("policy", family, DISTRIBUTIONS)
     arguments = {k: settings.get(k, default) for k, default in _FAMILY_ARGUMENTS.items()}
+    if isinstance(arguments["initial_std"], list):  # of each entry
+        arguments["initial_std"] = np.array(arguments["initial_std"])
     try:
         distribution = make(saved_action_space(settings), **arguments)
     except (Exception, SystemExit) as error:
@@ -223,6 +225,11 @@ def build_policy(settings: dict[str, Any]) -> Policy:
         settings["hidden_sizes"],
         initializer=settings.get("initializer", "orthogonal"),
     )
+
+
+def played_policy(settings: dict[str, Any]) -> Policy:
+    """Returns ``build_policy(settings)``, whose actions are clipped where it is played."""
+    return within_bounds(build_policy(settings), saved_action_space(settings))
 
 
 def saved_action_space(settings: dict[str, Any]) -> Box | Discrete:
@@ -275,10 +282,10 @@ class Player(NamedTuple):
 
         Args:
           observation: [O], or [N, O] for N environments, as the environment gave it.
-          rng: draws the action, as in training; without it the action is the policy's mode.
+          rng: draws the action; without it the action is the policy's mode.
 
         Returns:
-          The action [A], or [N, A]; discrete: an int, or [N].
+          The action [A], or [N, A], clipped to the bounds of the actions; discrete: an int, or [N].
 
         Raises:
           ValueError: the observation is not of this environment.
@@ -350,4 +357,4 @@ def _mode(policy: Policy, actor: Actor, observation: jax.Array) -> jax.Array:
 def _sample(policy: Policy, actor: Actor, observation: jax.Array, key: jax.Array) -> jax.Array:
     outputs = act(policy, actor, observation)
     noise = policy.distribution.noise(key, outputs.shape[:-1])
-    return policy.distribution.sample(outputs, noise)
+    return policy.distribution.clip(policy.distribution.sample(outputs, noise))

@@ -142,8 +142,9 @@ class PolicySettings:
     hidden_sizes: tuple[int, ...] = setting((32, 32), Range.LAYERS)
     """Units of each tanh layer of the policy network. The flag without a number makes the policy
     linear."""
-    initial_std: float = setting(0.5, Range.POSITIVE, Reader.STD, Mark.TRACED)
-    """Standard deviation of the actions before training, in the action's unit."""
+    initial_std: float | None = setting(None, Range.POSITIVE, Reader.STD, Mark.TRACED)
+    """Standard deviation of the actions before training, in the action's unit. None: of each entry,
+    half of half its range; 0.5 if it is not bounded."""
     final_std: float | None = _for_reinforce(
         None, Range.POSITIVE, Reader.DECAY, Reader.FREE_STD, Mark.TRACED
     )

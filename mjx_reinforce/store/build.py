@@ -4,15 +4,17 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import optax
 
-from mjx_reinforce.engine.base import Discrete, Environment, action_space, observation_size
+from mjx_reinforce.engine.base import Box, Discrete, Environment, action_space, observation_size
 from mjx_reinforce.engine.checks import check_kind, explain
 from mjx_reinforce.engine.contract import check_environment
 from mjx_reinforce.engine.devices import Devices
 from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.learning import estimators, schedules
 from mjx_reinforce.learning.contract import check_horizon
+from mjx_reinforce.learning.distributions import default_std
 from mjx_reinforce.learning.estimators import Estimator
 from mjx_reinforce.learning.learner import Learner, reinforce
 from mjx_reinforce.learning.natural_gradient import natural_gradient
@@ -77,7 +79,9 @@ def policy_settings(env: Environment, config: Config) -> dict[str, Any]:
     space, algorithm = action_space(env), find_algorithm(config.algorithm)
     if isinstance(space, Discrete):
         family, described = "categorical", {"num_actions": space.num_actions}
+        initial_std = config.initial_std
     else:
+        initial_std = _initial_std(space, config)
         family = "deterministic" if algorithm.search_episodes else "normal"
         described = {"action_low": space.low.tolist(), "action_high": space.high.tolist()}
     return {
@@ -85,7 +89,7 @@ def policy_settings(env: Environment, config: Config) -> dict[str, Any]:
         "policy": family if config.policy == "auto" else config.policy,
         "hidden_sizes": list(config.hidden_sizes),
         "initializer": "orthogonal",
-        "initial_std": config.initial_std,
+        "initial_std": initial_std,
         "rescale": True,
         "observation_size": observation_size(env),
         **described,
@@ -93,12 +97,20 @@ def policy_settings(env: Environment, config: Config) -> dict[str, Any]:
     }
 
 
+def _initial_std(space: Box, config: Config) -> Any:
+    """Returns the standard deviation before training, of all entries alike or a list of each."""
+    if config.initial_std is not None:
+        return config.initial_std
+    default = default_std(space)
+    return float(default[0]) if np.all(default == default[0]) else default.tolist()
+
+
 def build_reinforce(env: Environment, config: Config, **shared: Any) -> Learner:
     """Returns the learner of ``--algorithm reinforce``; arguments are those of a program."""
     return reinforce(
         env,
         estimator=_build_estimator(config, shared["horizon"]),
-        optimizer=_build_optimizer(config),
+        optimizer=_build_optimizer(config, policy_settings(env, config)["initial_std"]),
         update=_build_update(config, shared["policy"]),
         num_episodes=config.num_episodes,
         entropy_cost=config.entropy_cost,
@@ -155,7 +167,7 @@ def _build_value_baseline(config: Config, horizon: int) -> Estimator:
     )
 
 
-def _build_optimizer(config: Config) -> optax.GradientTransformation:
+def _build_optimizer(config: Config, initial_std: Any) -> optax.GradientTransformation:
     rate = config.learning_rate
     final = rate / 10 if config.final_learning_rate is None else config.final_learning_rate
     optimizer = make_optimizer(
@@ -170,7 +182,9 @@ def _build_optimizer(config: Config) -> optax.GradientTransformation:
     optimizer = optax.chain(optimizer, schedules.decay_rate(final / config.learning_rate, length))
     if config.final_std is None:
         return optimizer
-    ratio = config.final_std / config.initial_std
+    if isinstance(initial_std, list):
+        initial_std = np.array(initial_std)
+    ratio = config.final_std / initial_std
     return optax.chain(optimizer, schedules.shrink_std(ratio, length))
 
 
