@@ -34,7 +34,7 @@ from mjx_reinforce.files import (
     write_json,
 )
 from mjx_reinforce.learning import normalize
-from mjx_reinforce.learning.distributions import Distribution
+from mjx_reinforce.learning.distributions import Distribution, default_std
 from mjx_reinforce.learning.policy import Actor, Policy, act, mlp_policy, within_bounds
 from mjx_reinforce.registry import DISTRIBUTIONS, check_choice, is_own, load_choice
 
@@ -210,10 +210,12 @@ def build_policy(settings: dict[str, Any]) -> Policy:
     family = settings["policy"]
     make = load_choice("policy", family, DISTRIBUTIONS)
     arguments = {k: settings.get(k, default) for k, default in _FAMILY_ARGUMENTS.items()}
-    if isinstance(arguments["initial_std"], list):  # of each entry
-        arguments["initial_std"] = np.array(arguments["initial_std"])
+    space = saved_action_space(settings)
+    if is_own(family) and arguments["initial_std"] is None and isinstance(space, Box):
+        std = default_std(space)  # one number where it can be
+        arguments["initial_std"] = std if np.ptp(std) > 0 else float(std[0])
     try:
-        distribution = make(saved_action_space(settings), **arguments)
+        distribution = make(space, **arguments)
     except (Exception, SystemExit) as error:
         if not is_own(family):
             raise

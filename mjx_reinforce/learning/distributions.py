@@ -105,7 +105,7 @@ def normal(
         of a second network output (Gymnasium's REINFORCE tutorial); "sigmoid" for
         1 / (1 + exp(-o)), which stays below 1.
       initial_std: the standard deviation before training, in the action's unit, of all entries or
-        [A] of each; by default ``default_std(space)``.
+        [A] of each; by default ``default_std(space)``, for "sigmoid" 0.5 at most.
       rescale: False takes the network's output as the mean itself.
 
     Returns:
@@ -302,7 +302,10 @@ def gaussian_outputs(
     if std not in ("parameter", "softplus", "sigmoid"):
         raise ValueError(f"std must be 'parameter', 'softplus' or 'sigmoid', got {std!r}")
     middle, half = middle_and_half_range(space)
-    initial_std = default_std(space) if initial_std is None else initial_std
+    if initial_std is None:
+        initial_std = default_std(space)
+        if std == "sigmoid":
+            initial_std = np.minimum(initial_std, _STD_SHARE)
     shape = np.shape(initial_std)
     if shape not in ((), middle.shape):
         raise ValueError(

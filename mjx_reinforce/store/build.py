@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import optax
 
 from mjx_reinforce.engine.base import Box, Discrete, Environment, action_space, observation_size
@@ -79,9 +78,7 @@ def policy_settings(env: Environment, config: Config) -> dict[str, Any]:
     space, algorithm = action_space(env), find_algorithm(config.algorithm)
     if isinstance(space, Discrete):
         family, described = "categorical", {"num_actions": space.num_actions}
-        initial_std = config.initial_std
     else:
-        initial_std = _initial_std(space, config)
         family = "deterministic" if algorithm.search_episodes else "normal"
         described = {"action_low": space.low.tolist(), "action_high": space.high.tolist()}
     return {
@@ -89,7 +86,7 @@ def policy_settings(env: Environment, config: Config) -> dict[str, Any]:
         "policy": family if config.policy == "auto" else config.policy,
         "hidden_sizes": list(config.hidden_sizes),
         "initializer": "orthogonal",
-        "initial_std": initial_std,
+        "initial_std": config.initial_std,
         "rescale": True,
         "observation_size": observation_size(env),
         **described,
@@ -97,20 +94,12 @@ def policy_settings(env: Environment, config: Config) -> dict[str, Any]:
     }
 
 
-def _initial_std(space: Box, config: Config) -> Any:
-    """Returns the standard deviation before training, of all entries alike or a list of each."""
-    if config.initial_std is not None:
-        return config.initial_std
-    default = default_std(space)
-    return float(default[0]) if np.all(default == default[0]) else default.tolist()
-
-
 def build_reinforce(env: Environment, config: Config, **shared: Any) -> Learner:
     """Returns the learner of ``--algorithm reinforce``; arguments are those of a program."""
     return reinforce(
         env,
         estimator=_build_estimator(config, shared["horizon"]),
-        optimizer=_build_optimizer(config, policy_settings(env, config)["initial_std"]),
+        optimizer=_build_optimizer(config, action_space(env)),
         update=_build_update(config, shared["policy"]),
         num_episodes=config.num_episodes,
         entropy_cost=config.entropy_cost,
@@ -167,7 +156,7 @@ def _build_value_baseline(config: Config, horizon: int) -> Estimator:
     )
 
 
-def _build_optimizer(config: Config, initial_std: Any) -> optax.GradientTransformation:
+def _build_optimizer(config: Config, space: Box | Discrete) -> optax.GradientTransformation:
     rate = config.learning_rate
     final = rate / 10 if config.final_learning_rate is None else config.final_learning_rate
     optimizer = make_optimizer(
@@ -182,8 +171,9 @@ def _build_optimizer(config: Config, initial_std: Any) -> optax.GradientTransfor
     optimizer = optax.chain(optimizer, schedules.decay_rate(final / config.learning_rate, length))
     if config.final_std is None:
         return optimizer
-    if isinstance(initial_std, list):
-        initial_std = np.array(initial_std)
+    initial_std = config.initial_std
+    if initial_std is None and isinstance(space, Box):
+        initial_std = default_std(space)
     ratio = config.final_std / initial_std
     return optax.chain(optimizer, schedules.shrink_std(ratio, length))
 

@@ -207,7 +207,7 @@ def test_settings_become_the_update():
     """The learning rate leaves a share of the step, relative to its first value."""
     natural = Config(update="natural-gradient", max_kl=0.01, decay_steps=None)
     for settings, last in (({}, 1.0), ({"learning_rate": 1e-3}, 1.0), ({"decay_steps": 8}, 0.1)):
-        optimizer = _build_optimizer(dataclasses.replace(natural, **settings))
+        optimizer = _build_optimizer(dataclasses.replace(natural, **settings), Drift.action_space)
         state = optimizer.init(jnp.ones(2))
         for played, share in ((0.0, 1.0), (8.0, last)):
             clock = Clock(jnp.zeros(()), jnp.asarray(played))
