@@ -128,11 +128,12 @@ def within_kl(
 
     def kl_of(actor: Actor) -> jax.Array:
         new = act(policy, actor, visited.observation)
-        return visited.mean(kl_divergence(policy.distribution, old, new, visited.action))
+        kl = visited.mean(kl_divergence(policy.distribution, old, new, visited.action))
+        return jnp.where(jnp.isfinite(kl), kl, jnp.inf)  # what overflows is beyond any limit
 
     whole = kl_of(after)
     share = jnp.sqrt(max_kl / whole)
-    share = jnp.where(share > _LEAST_SHARE, share, _LEAST_SHARE**0.5)  # KL may be infinite, or NaN
+    share = jnp.where(share > _LEAST_SHARE, share, _LEAST_SHARE**0.5)
     first = jnp.where(whole <= max_kl, 1.0, share)
     return along(_share_within(lambda share: kl_of(along(share)), first, max_kl))
 
@@ -160,7 +161,7 @@ def _share_within(
     """Returns a share [] of a change whose KL is within the limit, or NaN if none was found.
 
     Args:
-      kl_at: share -> KL; NaN counts as too much.
+      kl_at: share -> KL, infinite where it overflows.
       first: the share that is tried first. 1 is taken as it is.
       max_kl: in nats.
     """
