@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
 from mjx_reinforce.engine.base import Trajectory
 from mjx_reinforce.engine.play.episode import while_any
@@ -111,7 +112,8 @@ def within_kl(
 
     Returns:
       An actor within the limit, to a hundredth of it. Where no share of the change is, its
-      parameters are NaN, for ``keep_finite`` to see.
+      parameters are NaN, for ``keep_finite`` to see; but an untrained policy, whose observations
+      were not scaled so far, takes the first scale and nothing else.
     """
     if max_kl is None:
         return after
@@ -135,7 +137,15 @@ def within_kl(
     share = jnp.sqrt(max_kl / whole)
     share = jnp.where(share > _LEAST_SHARE, share, _LEAST_SHARE**0.5)
     first = jnp.where(whole <= max_kl, 1.0, share)
-    return along(_share_within(lambda share: kl_of(along(share)), first, max_kl))
+    share = _share_within(lambda share: kl_of(along(share)), first, max_kl)
+    limited = along(share)
+    # The first scale also clips, which no share of it does less. It then comes alone and whole.
+    fresh = jnp.isnan(share) & (before.normalizer.count == 0) & (after.normalizer.count > 0)
+    fresh &= jnp.all(jnp.isfinite(ravel_pytree(after.params)[0]))
+    params = jax.tree.map(
+        lambda old, new: jnp.where(fresh, old, new), before.params, limited.params
+    )
+    return limited.replace(params=params)
 
 
 class _Tried(NamedTuple):
