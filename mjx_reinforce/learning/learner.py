@@ -163,8 +163,9 @@ def reinforce(
       horizon: T, steps after which an episode ends; by default ``env.max_episode_steps``.
       entropy_cost: weight of the policy's entropy H, in return per nat.
       max_kl: the most, in nats, by which an update may move the policy: the mean over the steps
-        that it visited of KL(before || after). A change that goes further is shortened, see
-        ``diagnostics.within_kl``; None shortens none. A new scale of the observations comes on top.
+        that it visited, 64 of them, of KL(before || after), with the scale of the observations
+        that each has. A change that goes further is shortened, the scale with it, see
+        ``diagnostics.within_kl``; None shortens none.
       normalize_steps: scale observations by the mean and std of about the first so many steps,
         then keep that scale; 0 does not scale, inf never stops. (Where a policy learns to keep
         the state near the middle, statistics that never stop shrink, and magnify the

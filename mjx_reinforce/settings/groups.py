@@ -214,7 +214,8 @@ class UpdateSettings:
     maximum."""
     max_kl: float | None = _for_reinforce(None, Range.POSITIVE, Mark.TRACED)
     """Most that an update may change the policy: the mean KL divergence (nats) before and after,
-    over the visited steps, approximately. A larger change is shortened. None: no maximum."""
+    over 64 of the visited steps. A larger change is shortened, that of the observations' scale with
+    it. None: no maximum."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
