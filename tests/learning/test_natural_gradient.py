@@ -237,9 +237,9 @@ def test_bounded_families_have_it_too(family):
 
 def test_nonsense_is_refused():
     policy = mlp_policy(1, normal(Drift.action_space))
+    unknown = mlp_policy(1, normal(Drift.action_space)._replace(kl=None))
     with pytest.raises(ValueError, match="KL divergence is known"):
-        unknown = normal(Drift.action_space)._replace(kl=None)
-        natural_gradient(mlp_policy(1, unknown), 0.01)
+        natural_gradient(unknown, 0.01)
     with pytest.raises(ValueError, match="max_kl must be positive"):
         natural_gradient(policy, 0.0)
     with pytest.raises(ValueError, match="damping must be positive"):
