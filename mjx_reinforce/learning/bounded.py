@@ -45,7 +45,7 @@ from mjx_reinforce.learning.distributions import (
 # recorded as the second.
 _SATURATED, _SATURATION = 5.0, 6.0
 # The least standard deviation of z: float32 recovers z from tanh(z) to 1e-3 or better.
-_LEAST_TANH_STD = 0.01
+_LEAST_TANH_STD = 0.005
 _PIVOT = 4.0
 # A bound farther away, in standard deviations, is treated as this far: it cuts off nothing either
 # way, and the square stays finite in float32.
@@ -67,7 +67,7 @@ def tanh_normal(
     range from a bound. Samples beyond are all recorded as z = 6 or -6 and counted with
     the probability of that whole tail, so the expected score is zero however far the
     policy saturates. For that z must vary by more than float32 loses: a standard deviation below
-    0.01 in z, a hundredth of half the range, is 0.01.
+    0.005 in z, a two-hundredth of half the range, is 0.005.
 
     ``kl`` is that of the Normals of z: exact, but that in the tails beyond 5 it also counts what no
     action shows. ``mode`` is the tanh of the mean: the median, as is usual, not the densest point.

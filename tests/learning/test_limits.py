@@ -174,11 +174,11 @@ def test_the_score_of_a_tanh_is_zero_at_small_deviations(mean, std):
     score = jax.jit(jax.vmap(jax.grad(family.log_prob), (None, 0)))(outputs, actions)
     error = np.std(score, axis=0) / np.sqrt(len(score))
     assert np.all(np.abs(np.mean(score, axis=0)) <= 5 * error + 1e-2)
-    assert float(family.std(outputs)[0]) == pytest.approx(1e-2)
+    assert float(family.std(outputs)[0]) == pytest.approx(max(std, 5e-3))
 
 
 def test_a_tanh_without_noise_is_refused():
-    with pytest.raises(ValueError, match=r"initial_std of 0.01 of half .* \[2.0, 0.02\]"):
+    with pytest.raises(ValueError, match=r"initial_std of 0.005 of half .* \[1.0, 0.01\]"):
         mr.tanh_normal(Box(np.array([-200.0, -2]), np.array([200.0, 2])), initial_std=0.5)
 
 
