@@ -48,7 +48,8 @@ def simulator(env: "Environment", player: Player, horizon: int) -> Simulator:
       player: the policy.
       horizon: T, the time limit in steps.
     """
-    distribution = player.policy.distribution
+    drawn = player.policy.distribution
+    distribution = drawn._replace(sample=lambda *given: drawn.clip(drawn.sample(*given)))
     play_step = functools.partial(
         step, env.step, functools.partial(act, player.policy), distribution
     )

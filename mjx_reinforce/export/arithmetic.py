@@ -12,20 +12,19 @@ from mjx_reinforce.learning import normalize
 from mjx_reinforce.learning.distributions import gaussian_outputs, middle_and_half_range
 
 #: What the deterministic action of a family is of the network's last layer x, once the scaling
-#: of means is part of that layer: x, x clipped to the bounds, middle + half tanh(x), or the
-#: number of the greatest entry.
-HEADS: dict[str, Literal["mean", "clip", "tanh", "argmax"]] = {
-    "normal": "mean",
-    "normal-softplus": "mean",
-    "normal-sigmoid": "mean",
-    "deterministic": "mean",
+#: of means is part of that layer: x clipped to the bounds, middle + half tanh(x), or the number of
+#: the greatest entry.
+HEADS: dict[str, Literal["clip", "tanh", "argmax"]] = {
+    "normal": "clip",
+    "normal-softplus": "clip",
+    "normal-sigmoid": "clip",
+    "deterministic": "clip",
     "truncated-normal": "clip",
     "tanh-normal": "tanh",
     "categorical": "argmax",
 }
 #: How the action follows from the last layer x, by what it is.
 _ENDINGS = {
-    "mean": "x",
     "clip": 'np.clip(x, P["low"], P["high"])',
     "tanh": 'P["middle"] + P["half"] * np.tanh(x)',
     "argmax": "np.argmax(x, axis=-1)",
@@ -69,8 +68,8 @@ def numpy_policy(
     shapes = f"[{size}] -> [{out}], or [N, {size}] -> [N, {out}]"
     if HEADS[family] == "argmax":
         shapes = f"[{size}] -> an integer, or [N, {size}] -> [N]"
-    if HEADS[family] == "mean":
-        shapes += "\n\nActions are not clipped: clip to the actuators' range before you send it."
+    if HEADS[family] == "clip":
+        shapes += "\n\nActions are clipped to the range that the environment declared."
     template = Path(__file__).with_name("numpy_policy.txt").read_text("utf-8")
     body = "\n    ".join(lines)
     source = template.format(name=name, shapes=shapes, env=ascii(env), seed=seed, body=body)
@@ -94,8 +93,6 @@ def _ending(head: str, settings: dict[str, Any]) -> tuple[np.ndarray, np.ndarray
     means = gaussian_outputs(settings["policy"], space, "parameter", 1.0, rescale)
     if head == "clip":
         return means.middle, means.half, {"low": space.low, "high": space.high}
-    if head == "tanh":
-        middle, half = middle_and_half_range(space)
-        extra = {"middle": middle, "half": half}
-        return (means.middle - middle) / half, means.half / half, extra
-    return means.middle, means.half, {}
+    middle, half = middle_and_half_range(space)
+    extra = {"middle": middle, "half": half}
+    return (means.middle - middle) / half, means.half / half, extra

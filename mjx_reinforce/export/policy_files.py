@@ -34,8 +34,8 @@ from mjx_reinforce.files import (
     write_json,
 )
 from mjx_reinforce.learning import normalize
-from mjx_reinforce.learning.distributions import Distribution
-from mjx_reinforce.learning.policy import Actor, Policy, act, mlp_policy
+from mjx_reinforce.learning.distributions import Distribution, default_std
+from mjx_reinforce.learning.policy import Actor, Policy, act, mlp_policy, within_bounds
 from mjx_reinforce.registry import DISTRIBUTIONS, check_choice, is_own, load_choice
 
 #: The name in the archive of what says that it belongs to the settings beside it.
@@ -47,7 +47,7 @@ _FAMILY_ARGUMENTS = {"initial_std": None, "rescale": True}
 class SavedPolicy(NamedTuple):
     """What a ``policy`` folder holds.
 
-    policy: the policy
+    policy: the policy; its mode is clipped to the action space
     actor: of one seed, or of all, stacked [S, ...]
     settings: what ``policy`` was built from, see ``save_policy``
     num_seeds: S, how many seeds the folder holds
@@ -157,7 +157,7 @@ def read_policy(
             f"mjx_reinforce.load(..., policy={settings['policy']!r})"
         )
     with naming_damage(settings_path):
-        policy = build_policy(settings)
+        policy = played_policy(settings)
         shapes = arrays_of(jax.eval_shape(functools.partial(_untrained, policy, settings)))
     with naming_damage(actor_path):
         num_seeds = _check_shapes(arrays, shapes)
@@ -244,8 +244,12 @@ def build_policy(settings: dict[str, Any]) -> Policy:
     family = settings["policy"]
     make = load_choice("policy", family, DISTRIBUTIONS)
     arguments = {k: settings.get(k, default) for k, default in _FAMILY_ARGUMENTS.items()}
+    space = saved_action_space(settings)
+    if is_own(family) and arguments["initial_std"] is None and isinstance(space, Box):
+        std = default_std(space)  # one number where it can be
+        arguments["initial_std"] = std if np.ptp(std) > 0 else float(std[0])
     try:
-        distribution = make(saved_action_space(settings), **arguments)
+        distribution = make(space, **arguments)
     except (Exception, SystemExit) as error:
         if not is_own(family):
             raise
@@ -257,6 +261,11 @@ def build_policy(settings: dict[str, Any]) -> Policy:
         settings["hidden_sizes"],
         initializer=settings.get("initializer", "orthogonal"),
     )
+
+
+def played_policy(settings: dict[str, Any]) -> Policy:
+    """Returns ``build_policy(settings)``, whose actions are clipped where it is played."""
+    return within_bounds(build_policy(settings), saved_action_space(settings))
 
 
 def saved_action_space(settings: dict[str, Any]) -> Box | Discrete:
@@ -309,10 +318,10 @@ class Player(NamedTuple):
 
         Args:
           observation: [O], or [N, O] for N environments, as the environment gave it.
-          rng: draws the action, as in training; without it the action is the policy's mode.
+          rng: draws the action; without it the action is the policy's mode.
 
         Returns:
-          The action [A], or [N, A]; discrete: an int, or [N].
+          The action [A], or [N, A], clipped to the bounds of the actions; discrete: an int, or [N].
 
         Raises:
           ValueError: the observation is not of this environment.
@@ -384,4 +393,4 @@ def _mode(policy: Policy, actor: Actor, observation: jax.Array) -> jax.Array:
 def _sample(policy: Policy, actor: Actor, observation: jax.Array, key: jax.Array) -> jax.Array:
     outputs = act(policy, actor, observation)
     noise = policy.distribution.noise(key, outputs.shape[:-1])
-    return policy.distribution.sample(outputs, noise)
+    return policy.distribution.clip(policy.distribution.sample(outputs, noise))

@@ -26,6 +26,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from numpy.polynomial import legendre
 
 from mjx_reinforce.engine.base import Box, Discrete
@@ -36,12 +37,15 @@ from mjx_reinforce.learning.distributions import (
     gaussian_outputs,
     middle_and_half_range,
     normal_entropy,
+    normal_kl,
     normal_log_density,
 )
 
 # float32 cannot recover a z much beyond the first number from tanh(z). Samples beyond it are all
 # recorded as the second.
 _SATURATED, _SATURATION = 5.0, 6.0
+# The least standard deviation of z: float32 recovers z from tanh(z) to 1e-3 or better.
+_LEAST_TANH_STD = 0.005
 _PIVOT = 4.0
 # A bound farther away, in standard deviations, is treated as this far: it cuts off nothing either
 # way, and the square stays finite in float32.
@@ -49,7 +53,11 @@ _FAR = 1e9
 
 
 def tanh_normal(
-    space: Box | Discrete, *, std: str = "parameter", initial_std: float = 0.5, rescale: bool = True
+    space: Box | Discrete,
+    *,
+    std: str = "parameter",
+    initial_std: ArrayLike | None = None,
+    rescale: bool = True,
 ) -> Distribution:
     """``normal`` through a tanh into the action's finite range (Haarnoja et al. 2018, appendix C).
 
@@ -58,9 +66,11 @@ def tanh_normal(
     action, to a thousandth of a standard unit up to |z| = 5, which is within 5e-5 of the
     range from a bound. Samples beyond are all recorded as z = 6 or -6 and counted with
     the probability of that whole tail, so the expected score is zero however far the
-    policy saturates.
+    policy saturates. For that z must vary by more than float32 loses: a standard deviation below
+    0.005 in z, a two-hundredth of half the range, is 0.005.
 
-    ``mode`` is the tanh of the mean: the median, as is usual, not the densest point.
+    ``kl`` is that of the Normals of z: exact, but that in the tails beyond 5 it also counts what no
+    action shows. ``mode`` is the tanh of the mean: the median, as is usual, not the densest point.
     ``entropy`` is exact to 1e-7 nats up to a standard deviation of 1 in z, 3e-3 at 3.
 
     Examples:
@@ -71,9 +81,19 @@ def tanh_normal(
     """
     layout = _bounded_outputs("tanh-normal", space, std, initial_std, rescale)
     middle, half = middle_and_half_range(layout.box)
+    least, initial = _LEAST_TANH_STD * half, layout.initial_std
+    if isinstance(initial, np.ndarray) and np.any(initial < least):
+        raise ValueError(
+            f"tanh-normal needs an initial_std of {_LEAST_TANH_STD} of half the action's range or "
+            f"more, here {least.tolist()}, got {initial.tolist()}; or choose truncated-normal"
+        )
 
     def of_z(mean, std):
-        return (mean - middle) / half, std / half
+        return (mean - middle) / half, jnp.maximum(std / half, _LEAST_TANH_STD)
+
+    def of_both(function):
+        """Returns a function of two Normals that is given those of z."""
+        return lambda *given: function(*of_z(*given[:2]), *of_z(*given[2:]))
 
     def sample(noise, mean, std):
         mean, std = of_z(mean, std)
@@ -82,14 +102,16 @@ def tanh_normal(
             jnp.where(jnp.abs(z) < _SATURATED, z, jnp.sign(z) * _SATURATION)
         )
 
-    return layout.family(
+    family = layout.family(
         sample=sample,
         mode=lambda mean: middle + half * jnp.tanh((mean - middle) / half),
         log_density=lambda action, mean, std: _tanh_log_density(
             (action - middle) / half, *of_z(mean, std), half
         ),
         entropy=lambda mean, std: _tanh_entropy(*of_z(mean, std), half),
+        kl=of_both(normal_kl),
     )
+    return family._replace(std=lambda outputs: half * of_z(*layout.split(outputs))[1])
 
 
 def _tanh_log_density(
@@ -128,12 +150,16 @@ def _log_tanh_slope(z: jax.Array) -> jax.Array:
 
 
 def truncated_normal(
-    space: Box | Discrete, *, std: str = "parameter", initial_std: float = 0.5, rescale: bool = True
+    space: Box | Discrete,
+    *,
+    std: str = "parameter",
+    initial_std: ArrayLike | None = None,
+    rescale: bool = True,
 ) -> Distribution:
     """``normal``, restricted to the action's range, which must be finite.
 
-    Density, entropy and their gradients stay exact when the mean is far outside the range, and so
-    does the sampling, by the inverse distribution function. The noise is uniform in (0, 1).
+    Density, entropy, KL and their gradients stay exact when the mean is far outside the range, and
+    so does the sampling, by the inverse distribution function. The noise is uniform in (0, 1).
 
     Examples:
       >>> import numpy as np
@@ -152,6 +178,7 @@ def truncated_normal(
         mode=restricted(jnp.clip),
         log_density=restricted(truncated_log_density),
         entropy=restricted(truncated_entropy),
+        kl=restricted(truncated_kl),
         noise=_open_uniform,
     )
 
@@ -290,6 +317,34 @@ def truncated_entropy(
     offset = (segment(1, c, right) - segment(1, -c, left)) / mass
     edges = left * jnp.exp(-left * (0.5 * left - c)) + right * jnp.exp(-right * (0.5 * right + c))
     return jnp.log(std) + jnp.log(mass) + 0.5 * (1.0 + c * offset - edges / mass)
+
+
+def truncated_kl(
+    mean: jax.Array,
+    std: jax.Array,
+    other_mean: jax.Array,
+    other_std: jax.Array,
+    low: jax.Array,
+    high: jax.Array,
+) -> jax.Array:
+    """Returns KL(first || second) [...] in nats of two Normals restricted to [low, high].
+
+    With t as above of the first, and r t + a that of the second, it is log(s' W' / (s W)) plus the
+    mean under the first of (r t + a)^2 / 2 + c' (r t + a) - t^2 / 2 - c t. The terms are small
+    where the two are nearly equal.
+    """
+    mode, c, left, right = anchor(mean, std, low, high)
+    other_mode, other_c, other_left, other_right = anchor(other_mean, other_std, low, high)
+    mass = segment(0, -c, left) + segment(0, c, right)
+    other_mass = segment(0, -other_c, other_left) + segment(0, other_c, other_right)
+    offset = (segment(1, c, right) - segment(1, -c, left)) / mass
+    square = (segment(2, c, right) + segment(2, -c, left)) / mass
+    ratio, apart = std / other_std, (mode - other_mode) / other_std
+    log_ratio = jnp.log(other_mass / mass) - jnp.log(ratio)
+    linear = ratio * (other_c + apart) - c
+    quadratic = 0.5 * (ratio - 1.0) * (ratio + 1.0)
+    kl = log_ratio + quadratic * square + linear * offset + apart * (0.5 * apart + other_c)
+    return kl + jax.lax.stop_gradient(jnp.maximum(-kl, 0.0))  # of equal ones the derivatives count
 
 
 def truncated_sample(

@@ -6,8 +6,9 @@ trained and the same for all observations. Sampling has two steps, ``noise`` and
 noise depends on the key alone, so that every engine gets the same actions from the same key.
 
 A family is one function of the action space, ``initial_std`` (the standard deviation before
-training, in the action's unit) and ``rescale`` (whether the network's output is scaled to the
-action's range). It raises ValueError for a space that it does not support.
+training, in the action's unit: a number, or [A] for each entry) and ``rescale`` (whether the
+network's output is scaled to the action's range). It raises ValueError for a space that it does not
+support.
 
 All Gaussian families are one: an independent Normal in each entry of the action, and what is done
 to a sample of it. ``normal`` leaves it; those of ``bounded`` keep it within the action's range.
@@ -28,6 +29,9 @@ from mjx_reinforce.engine.checks import check_number, known_number
 
 LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 _MIN_STD = 1e-6
+#: The standard deviation before training, as a share of half the action's range, where none is
+#: asked for. So a policy explores the same whatever unit its actions have.
+_STD_SHARE = 0.5
 
 
 class Distribution(NamedTuple):
@@ -44,6 +48,9 @@ class Distribution(NamedTuple):
       std: (outputs [..., K]) -> [..., A] the standard deviation in the action's unit, before what
         the family does to keep actions in their range; None where there is none
       kl: (outputs, other outputs) -> [...] the divergence KL(first || second) in nats, if known
+      clip: (action) -> the nearest that the environment's bounds allow: what is played of a trained
+        policy. Learners and loaded policies have it in their mode, too, see
+        ``policy.within_bounds``; training draws actions that are not clipped
 
     Examples:
       >>> import jax, jax.numpy as jnp
@@ -63,6 +70,7 @@ class Distribution(NamedTuple):
     entropy: Callable[[jax.Array], jax.Array]
     std: Callable[[jax.Array], jax.Array] | None = None
     kl: Callable[[jax.Array, jax.Array], jax.Array] | None = None
+    clip: Callable[[jax.Array], jax.Array] = lambda action: action
 
     def __repr__(self) -> str:
         return f"Distribution({self.num_outputs} outputs, {len(self.constants)} constants)"
@@ -74,7 +82,11 @@ def default_distribution(space: Box | Discrete) -> Distribution:
 
 
 def normal(
-    space: Box | Discrete, *, std: str = "parameter", initial_std: float = 0.5, rescale: bool = True
+    space: Box | Discrete,
+    *,
+    std: str = "parameter",
+    initial_std: ArrayLike | None = None,
+    rescale: bool = True,
 ) -> Distribution:
     """An independent Normal in each entry, unbounded.
 
@@ -83,13 +95,17 @@ def normal(
     entry the mean is the output itself. Samples may fall outside the bounds, and the
     environment decides what then happens (MuJoCo clamps them in the actuator).
 
+    float32 tells a sample from its mean while the standard deviation is above some 1e-6 of the
+    mean. Below, the gradient is rounding; below 1e-18 of it, NaN, and the update is skipped.
+
     Args:
       space: the action bounds, [A] each.
       std: "parameter" for one trained log-std an entry, the same in all states
         (Schulman et al. 2015, arXiv:1502.05477); "softplus" for log(1 + exp(o))
         of a second network output (Gymnasium's REINFORCE tutorial); "sigmoid" for
         1 / (1 + exp(-o)), which stays below 1.
-      initial_std: the standard deviation before training, in the action's unit.
+      initial_std: the standard deviation before training, in the action's unit, of all entries or
+        [A] of each; by default ``default_std(space)``, for "sigmoid" 0.5 at most.
       rescale: False takes the network's output as the mean itself.
 
     Returns:
@@ -108,35 +124,31 @@ def normal(
       ([0.0, 0.0], ())
     """
     layout = gaussian_outputs("normal", space, std, initial_std, rescale)
-
-    def kl(outputs, others):
-        return jnp.sum(normal_kl(*layout.split(outputs), *layout.split(others)), axis=-1)
-
-    family = layout.family(
+    return layout.family(
         sample=lambda noise, mean, std: mean + std * noise,
         mode=lambda mean: mean,
         log_density=normal_log_density,
         entropy=lambda mean, std: normal_entropy(std),
+        kl=normal_kl,
     )
-    return family._replace(kl=kl)
 
 
 def normal_softplus(
-    space: Box | Discrete, *, initial_std: float = 0.5, rescale: bool = True
+    space: Box | Discrete, *, initial_std: ArrayLike | None = None, rescale: bool = True
 ) -> Distribution:
     """``normal`` with a state-dependent softplus standard deviation."""
     return normal(space, std="softplus", initial_std=initial_std, rescale=rescale)
 
 
 def normal_sigmoid(
-    space: Box | Discrete, *, initial_std: float = 0.5, rescale: bool = True
+    space: Box | Discrete, *, initial_std: ArrayLike | None = None, rescale: bool = True
 ) -> Distribution:
     """``normal`` with a state-dependent sigmoid standard deviation, below 1."""
     return normal(space, std="sigmoid", initial_std=initial_std, rescale=rescale)
 
 
 def categorical(
-    space: Box | Discrete, *, initial_std: float | None = None, rescale: bool = True
+    space: Box | Discrete, *, initial_std: ArrayLike | None = None, rescale: bool = True
 ) -> Distribution:
     """A softmax over the actions of a discrete space; an action is an int32 [...].
 
@@ -191,14 +203,14 @@ class GaussianOutputs(NamedTuple):
 
     box: the action bounds, [A] each
     std: "parameter", "softplus" or "sigmoid"
-    initial_std: the standard deviation before training
+    initial_std: the standard deviation before training, of all entries or [A] of each
     middle: [A] the mean where the network's output is 0
     half: [A] what a network output of 1 adds to it
     """
 
     box: Box
     std: str
-    initial_std: float | jax.Array
+    initial_std: np.ndarray | jax.Array
     middle: np.ndarray
     half: np.ndarray
 
@@ -218,9 +230,12 @@ class GaussianOutputs(NamedTuple):
         if self.std == "parameter":
             std = jnp.exp(raw)
         elif self.std == "softplus":
-            std = jax.nn.softplus(raw + float(np.log(np.expm1(initial)))) + _MIN_STD
+            # Of a large std, exp would overflow; the logarithm is then the std itself.
+            offset = np.where(initial < 30, np.log(np.expm1(np.minimum(initial, 30))), initial)
+            std = jax.nn.softplus(raw + offset.astype(raw.dtype)) + _MIN_STD
         else:
-            std = jax.nn.sigmoid(raw + float(np.log(initial / (1.0 - initial)))) + _MIN_STD
+            offset = np.log(initial / (1.0 - initial))
+            std = jax.nn.sigmoid(raw + offset.astype(raw.dtype)) + _MIN_STD
         return self.mean(outputs), std
 
     def family(
@@ -230,6 +245,7 @@ class GaussianOutputs(NamedTuple):
         mode: Callable[..., Any],
         log_density: Callable[..., Any],
         entropy: Callable[..., Any],
+        kl: Callable[..., Any],
         noise: Callable[..., Any] = jax.random.normal,
     ) -> Distribution:
         """Returns the distribution of independent entries.
@@ -239,12 +255,13 @@ class GaussianOutputs(NamedTuple):
           mode: (mean) -> action.
           log_density: (action, mean, std) -> the log-probability of each entry.
           entropy: (mean, std) -> that of each entry, in nats.
+          kl: (mean, std, other mean, other std) -> that of each entry, in nats.
           noise: (key, shape) -> what ``sample`` transforms.
         """
         constant = self.std == "parameter"
         return Distribution(
             num_outputs=self.size if constant else 2 * self.size,
-            constants=(_log(self.initial_std),) * self.size if constant else (),
+            constants=_logs(self.initial_std, self.size) if constant else (),
             noise=lambda key, shape: noise(key, (*shape, self.size)),
             sample=lambda outputs, noise: sample(noise, *self.split(outputs)),
             mode=lambda outputs: mode(self.mean(outputs)),
@@ -253,11 +270,14 @@ class GaussianOutputs(NamedTuple):
             ),
             entropy=lambda outputs: jnp.sum(entropy(*self.split(outputs)), axis=-1),
             std=lambda outputs: self.split(outputs)[1],
+            kl=lambda outputs, others: jnp.sum(
+                kl(*self.split(outputs), *self.split(others)), axis=-1
+            ),
         )
 
 
 def gaussian_outputs(
-    name: str, space: Box | Discrete, std: str, initial_std: float | jax.Array, rescale: bool
+    name: str, space: Box | Discrete, std: str, initial_std: ArrayLike | None, rescale: bool
 ) -> GaussianOutputs:
     """Checks the arguments of a Gaussian family and returns the layout of its outputs.
 
@@ -265,8 +285,9 @@ def gaussian_outputs(
       name: the family's name, for the messages.
       space: the action bounds, [A] each.
       std: "parameter", "softplus" or "sigmoid", as in ``normal``.
-      initial_std: the standard deviation before training, in the action's unit; for "parameter"
-        it may be traced, and is then taken on trust.
+      initial_std: the standard deviation before training, in the action's unit, of all entries or
+        [A] of each; for "parameter" it may be traced, and is then taken on trust. None:
+        ``default_std``.
       rescale: False takes the network's output as the mean itself.
 
     Raises:
@@ -280,19 +301,42 @@ def gaussian_outputs(
         )
     if std not in ("parameter", "softplus", "sigmoid"):
         raise ValueError(f"std must be 'parameter', 'softplus' or 'sigmoid', got {std!r}")
-    check_number("initial_std", initial_std, positive=True)
-    number = known_number(initial_std)
-    if std == "sigmoid" and number is not None and number >= 1:
-        raise ValueError(f"a sigmoid std stays below 1, got initial_std={number}")
     middle, half = middle_and_half_range(space)
+    if initial_std is None:
+        initial_std = default_std(space)
+        if std == "sigmoid":
+            initial_std = np.minimum(initial_std, _STD_SHARE)
+    shape = np.shape(initial_std)
+    if shape not in ((), middle.shape):
+        raise ValueError(
+            f"initial_std must be a number, or {list(middle.shape)}, one for each entry, "
+            f"got {initial_std}"
+        )
+    for entry in initial_std if shape else (initial_std,):  # type: ignore[union-attr]
+        check_number("initial_std", entry, positive=True)
+        number = known_number(entry)
+        if std == "sigmoid" and number is not None and number >= 1:
+            raise ValueError(
+                f"a sigmoid std stays below 1, got initial_std={number}, in the action's unit; "
+                "give a smaller one, or choose normal"
+            )
     if not rescale:
         middle, half = np.zeros_like(middle), np.ones_like(half)
+    if not isinstance(initial_std, jax.core.Tracer):
+        initial_std = np.asarray(initial_std, float)
     return GaussianOutputs(space, std, initial_std, middle, half)
 
 
-def _log(x: ArrayLike) -> Any:
-    """Returns a logarithm, rounded once where the number is known."""
-    return jnp.log(x) if isinstance(x, jax.core.Tracer) else float(np.log(x))
+def default_std(space: Box) -> np.ndarray:
+    """Returns half of half the range of each entry, [A]; 0.5 where it is not bounded."""
+    return _STD_SHARE * middle_and_half_range(space)[1].astype(float)
+
+
+def _logs(std: Any, size: int) -> tuple[Any, ...]:
+    """Returns the logarithms of standard deviations, rounded once where they are known."""
+    if isinstance(std, jax.core.Tracer):
+        return tuple(jnp.broadcast_to(jnp.log(std), size))
+    return tuple(np.broadcast_to(np.log(std), size).tolist())
 
 
 def normal_log_density(x: jax.Array, mean: jax.Array, std: jax.Array) -> jax.Array:

@@ -137,7 +137,9 @@ def standardize(
     """Divides an estimator's weights by their standard deviation plus ``floor``.
 
     The weights of a solved policy are noise. A floor as large as the noise of the return keeps
-    them small; without it they would be scaled up and would spoil the policy.
+    them small; without it they would be scaled up and would spoil the policy. Weights whose
+    standard deviation, floor included, is below the rounding of the returns are that rounding
+    alone, and become 0.
 
     Args:
       estimator: whose weights are divided.
@@ -161,9 +163,13 @@ def standardize(
         mask = trajectory.mask
         steps = jnp.maximum(jnp.sum(mask), 1)
         mean = jnp.sum(jnp.where(mask, weight, 0.0)) / steps if center else 0.0
-        variance = jnp.sum(jnp.where(mask, (weight - mean) ** 2, 0.0)) / steps
-        scaled = jnp.where(mask, (weight - mean) / (jnp.sqrt(variance) + floor), 0.0)
-        return scaled, state, metrics | {"weight_std": jnp.sqrt(variance)}
+        unit = _unit(jnp.where(mask, weight - mean, 0.0))
+        variance = jnp.sum(jnp.where(mask, ((weight - mean) / unit) ** 2, 0.0)) / steps
+        std = unit * jnp.sqrt(variance)
+        rounding = jnp.sum(jnp.finfo(weight.dtype).eps * jnp.abs(trajectory.reward), axis=0)
+        varies = std + floor > jnp.max(jnp.where(trajectory.nonfinite, 0.0, rounding))
+        scaled = jnp.where(mask & varies, (weight - mean) / (std + floor), 0.0)
+        return scaled, state, metrics | {"weight_std": std}
 
     return estimator._replace(update=update)
 
@@ -221,6 +227,9 @@ def explained_variance(residual: jax.Array, returns: jax.Array, mask: jax.Array)
     """
     steps = jnp.maximum(jnp.sum(mask), 1)
 
+    unit = _unit(jnp.where(mask, returns, 0.0))
+    residual, returns = residual / unit, returns / unit
+
     def mean(x):
         return jnp.sum(jnp.where(mask, x, 0.0)) / steps
 
@@ -230,6 +239,12 @@ def explained_variance(residual: jax.Array, returns: jax.Array, mask: jax.Array)
     total = variance(returns)
     varies = total > 1e-12 * mean(returns) ** 2
     return jnp.where(varies, 1.0 - variance(residual) / jnp.where(varies, total, 1.0), jnp.nan)
+
+
+def _unit(x: jax.Array) -> jax.Array:
+    """Returns what numbers are divided by before they are squared: 1 if no square overflows."""
+    largest = jnp.max(jnp.abs(x))
+    return jnp.where(largest > 1e15, largest, 1.0)
 
 
 def check_discount(discount: float | jax.Array) -> None:

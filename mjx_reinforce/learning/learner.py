@@ -26,7 +26,7 @@ from mjx_reinforce.learning import contract, counts, diagnostics, normalize
 from mjx_reinforce.learning.diagnostics import Metrics
 from mjx_reinforce.learning.distributions import default_distribution
 from mjx_reinforce.learning.estimators import Estimator, leave_one_out, standardize
-from mjx_reinforce.learning.policy import Actor, Policy, act, mlp_policy
+from mjx_reinforce.learning.policy import Actor, Policy, act, mlp_policy, within_bounds
 from mjx_reinforce.learning.updates import Clock, Problem, Update, full_batch, make_optimizer
 
 
@@ -77,7 +77,7 @@ class Learner(NamedTuple):
         That of ``reinforce`` also takes a rollout in place of the engine's
       learn: (TrainState, what was played, key) -> (TrainState, metrics), with the actor and all
         else that changes by learning; consumes the key
-      policy: the policy that is trained
+      policy: the policy that is trained; its mode is clipped to the action space
       engine: how its episodes are played
 
     Examples:
@@ -164,8 +164,9 @@ def reinforce(
       horizon: T, steps after which an episode ends; by default ``env.max_episode_steps``.
       entropy_cost: weight of the policy's entropy H, in return per nat.
       max_kl: the most, in nats, by which an update may move the policy: the mean over the steps
-        that it visited of KL(before || after). A change that goes further is shortened, see
-        ``diagnostics.within_kl``; None shortens none. A new scale of the observations comes on top.
+        that it visited, 64 of them, of KL(before || after), with the scale of the observations
+        that each has. A change that goes further is shortened, the scale with it, see
+        ``diagnostics.within_kl``; None shortens none.
       normalize_steps: scale observations by the mean and std of about the first so many steps,
         then keep that scale; 0 does not scale, inf never stops. (Where a policy learns to keep
         the state near the middle, statistics that never stop shrink, and magnify the
@@ -200,6 +201,7 @@ def reinforce(
     if policy is None:
         policy = mlp_policy(size, default_distribution(action_space(env)))
     contract.check_policy(policy, env, size, likelihood=True)
+    policy = within_bounds(policy, action_space(env))
     optimizer = make_optimizer() if optimizer is None else optimizer
     check_kind("optimizer", optimizer, optax.GradientTransformation, "optax.adam(1e-2)")
     update = full_batch() if update is None else update
@@ -287,17 +289,20 @@ class _Reinforce:
     ) -> tuple[TrainState, Metrics]:
         """``Learner.learn``: the update, in the order of the formula."""
         before, visited = state.actor, diagnostics.visited_steps(trajectory)
+        # A return that overflows is none, either.
+        overflow = ~jnp.isfinite(episode_returns(trajectory))
+        trajectory = trajectory.replace(nonfinite=trajectory.nonfinite | overflow)
         # Normalize, weigh, follow the gradient, limit the change, count, keep what is finite.
         seen = normalize.seen(before.normalizer, trajectory)
         weight, estimator_state, metrics = self.estimator.update(state.estimator_state, seen)
         problem = self._problem(state, seen, weight)
         params, opt_state, measured = self.update(problem, key, before.params, state.opt_state)
-        params = diagnostics.within_kl(self.policy, before, params, visited, self.max_kl)
         counted = trajectory.mask & ~trajectory.nonfinite
         normalizer = normalize.update(
             before.normalizer, trajectory.observation, counted, *self.normalize_limits
         )
-        actor = Actor(params=params, normalizer=normalizer)
+        proposed = Actor(params=params, normalizer=normalizer)
+        actor = diagnostics.within_kl(self.policy, before, proposed, visited, self.max_kl)
         after = state.replace(actor=actor, opt_state=opt_state, estimator_state=estimator_state)
         after, skipped = keep_finite(after, state)
 

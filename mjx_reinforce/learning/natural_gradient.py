@@ -82,8 +82,8 @@ def natural_gradient(
     check_count("iterations", iterations)
     if policy.distribution.kl is None:
         raise ValueError(
-            "the natural gradient needs a distribution whose KL divergence is known: choose "
-            "normal, normal-softplus, normal-sigmoid or categorical, or another update"
+            "the natural gradient needs a distribution whose KL divergence is known, as that of "
+            "all families of the package is: give yours a kl, or choose another update"
         )
     solve = _by_conjugate_gradients(policy, damping, iterations)
 

@@ -11,6 +11,8 @@ CLIP = 10.0
 _LEAST_STD = 1e-4
 #: Whole numbers are exact in float32 up to this.
 _EXACT = 2**24
+# A larger observation counts as this: float32 holds the sum of the squares of 1e8 of them.
+_LARGEST = 1e15
 
 
 class Normalizer(struct.PyTreeNode, kw_only=True):
@@ -49,7 +51,8 @@ def update(
 
     Args:
       normalizer: the statistics so far.
-      observation: [T, N, O]; entries outside the mask have no effect.
+      observation: [T, N, O]; entries outside the mask have no effect, and one beyond 1e15 counts
+        as 1e15.
       mask: [T, N] True where the observation counts.
       at_most: a batch is merged only if fewer observations than this are counted so far.
       min_std: a smaller standard deviation of the two together is raised to this, in the
@@ -60,6 +63,7 @@ def update(
     """
     mask = mask & (normalizer.count < at_most)
     kept = mask[..., None]
+    observation = jnp.clip(observation, -_LARGEST, _LARGEST)
     count = jnp.sum(mask, dtype=normalizer.count.dtype)
     divisor = jnp.maximum(count, 1.0)
     mean = jnp.sum(jnp.where(kept, observation, 0.0), axis=(0, 1)) / divisor
@@ -79,6 +83,18 @@ def update(
         mean=normalizer.mean + delta * count / total,
         m2=jnp.maximum(m2, min_std**2 * (normalizer.count + count)),
     )
+
+
+def between(before: Normalizer, after: Normalizer, share: jax.Array) -> Normalizer:
+    """Returns the statistics that a share [] of the way leads to; 1 leads to ``after`` itself.
+
+    Before the first observation the scale is 1, and it moves from there.
+    """
+    part = jax.tree.map(lambda old, new: old + share * (new - old), before, after)
+    variance = after.m2 / jnp.maximum(after.count, 1.0)
+    first = part.count * (1.0 + share * (variance - 1.0))
+    part = part.replace(m2=jnp.where(before.count > 0, part.m2, first))
+    return jax.tree.map(lambda some, new: jnp.where(share < 1.0, some, new), part, after)
 
 
 def apply(normalizer: Normalizer, observation: jax.Array) -> jax.Array:

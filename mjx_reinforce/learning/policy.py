@@ -5,9 +5,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import linen as nn
 from flax import struct
 
+from mjx_reinforce.engine.base import Box, Discrete
 from mjx_reinforce.engine.checks import check_count, check_kind, check_name, check_type
 from mjx_reinforce.engine.play import units
 from mjx_reinforce.learning import normalize
@@ -145,6 +147,23 @@ def mlp_policy(
         return jnp.concatenate([outputs, fixed], axis=-1)
 
     return Policy(init, apply, distribution)
+
+
+def within_bounds(policy: Policy, space: Box | Discrete) -> Policy:
+    """Returns a policy that is played within the bounds of the action space.
+
+    Its mode is clipped, and its distribution knows how to ``clip`` what is drawn. Samples are not
+    clipped themselves: training learns from them (docs/settings.md says why).
+    """
+    if isinstance(space, Discrete) or not np.isfinite([space.low, space.high]).any():
+        return policy
+
+    def clip(action: jax.Array) -> jax.Array:
+        return jnp.clip(action, *(jnp.asarray(bound, action.dtype) for bound in space))
+
+    family = policy.distribution
+    inside = family._replace(mode=lambda outputs: clip(family.mode(outputs)), clip=clip)
+    return policy._replace(distribution=inside)
 
 
 class Actor(struct.PyTreeNode, kw_only=True):

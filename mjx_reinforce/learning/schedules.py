@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jax.typing import ArrayLike
 
 from mjx_reinforce.engine.checks import check_count, check_number
 from mjx_reinforce.learning.updates import Clock
@@ -109,7 +110,7 @@ def decay_rate(
 
 
 def shrink_std(
-    ratio: float | jax.Array, env_steps: float | jax.Array | None = None
+    ratio: ArrayLike, env_steps: float | jax.Array | None = None
 ) -> optax.GradientTransformationExtraArgs:
     """Multiplies standard deviations that are parameters by ``ratio`` in all, evenly in the log.
 
@@ -118,7 +119,7 @@ def shrink_std(
     families that keep one for all states; others have no entries.
 
     Args:
-      ratio: of the standard deviation at the end to that at the start.
+      ratio: of the standard deviation at the end to that at the start, [] or [A] of each entry.
       env_steps: over which it shrinks; None: over the budget.
     """
 

@@ -135,9 +135,12 @@ def descend(
     The optimizer is given what ``turn`` makes of the mean gradient.
     """
     grads = jax.tree.map(lambda g: g / divisor, grads)
+    norm = optax.tree.norm(grads)
+    # A norm that overflows would make a step of nothing; NaN has the update skipped and counted.
+    grads = jax.tree.map(lambda g: jnp.where(jnp.isfinite(norm), g, jnp.nan), grads)
     optimizer = optax.with_extra_args_support(problem.optimizer)
     changes, opt_state = optimizer.update(turn(grads), opt_state, params, clock=problem.clock)
-    metrics = {"gradient_norm": optax.tree.norm(grads)}
+    metrics = {"gradient_norm": norm}
     return optax.apply_updates(params, changes), opt_state, metrics
 
 

@@ -30,6 +30,7 @@ from mjx_reinforce.engine.play.rollouts import episode_returns
 from mjx_reinforce.learning import contract, normalize
 from mjx_reinforce.learning.estimators import replace_broken
 from mjx_reinforce.learning.learner import Metrics, first_actor, keep_finite, update_metrics
+from mjx_reinforce.learning.policy import within_bounds
 
 #: (directions, like the params with a leading axis [D]; returns [2, D] forwards and backwards;
 #: noise_std) -> what the parameters move by, over the step size.
@@ -110,7 +111,8 @@ def ars(
         normalize_limits=(normalize_steps, normalize_min_std),
         engine=choose(engine, env),
     )
-    return mr.Learner(search.init, search.play, search.learn, policy, search.engine)
+    played = within_bounds(policy, base.action_space(env))
+    return mr.Learner(search.init, search.play, search.learn, played, search.engine)
 
 
 def make(env: mr.Environment, config: Any, **shared: Any) -> mr.Learner:

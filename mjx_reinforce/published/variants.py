@@ -8,6 +8,7 @@ follows samples of an older policy. It has no importance weights, as the program
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.typing import ArrayLike
 
 from mjx_reinforce.engine.base import Box, Discrete
 from mjx_reinforce.engine.checks import check_count
@@ -182,7 +183,7 @@ def per_step(update: Update) -> Update:
 
 
 def deterministic(
-    space: Box | Discrete, *, initial_std: float | None = None, rescale: bool = True
+    space: Box | Discrete, *, initial_std: ArrayLike | None = None, rescale: bool = True
 ) -> Distribution:
     """A single point: the action is the network's output, rescaled like the mean of ``normal``.
 

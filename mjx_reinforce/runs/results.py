@@ -13,7 +13,7 @@ import numpy as np
 
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.engine.checks import check_kind
-from mjx_reinforce.export.policy_files import Player, build_policy
+from mjx_reinforce.export.policy_files import Player, played_policy
 from mjx_reinforce.export.run_files import Which
 from mjx_reinforce.files import Arrays, naming_damage, read_arrays, read_json
 from mjx_reinforce.learning.policy import Actor, Policy
@@ -159,7 +159,7 @@ def run(
         training=driver.record.training(),
         test_returns=np.asarray(summary["final_test_returns"]),
         best_test_returns=np.asarray(summary["best_test_returns"]),
-        policy=build_policy(outcome.policy),
+        policy=played_policy(outcome.policy),
         actor=driver.states.train_states.actor,
         best=driver.best.actor,
         summary=summary,

@@ -142,8 +142,9 @@ class PolicySettings:
     hidden_sizes: tuple[int, ...] = setting((32, 32), Range.LAYERS)
     """Units of each tanh layer of the policy network. The flag without a number makes the policy
     linear."""
-    initial_std: float = setting(0.5, Range.POSITIVE, Reader.STD, Mark.TRACED)
-    """Standard deviation of the actions before training, in the action's unit."""
+    initial_std: float | None = setting(None, Range.POSITIVE, Reader.STD, Mark.TRACED)
+    """Standard deviation of the actions before training, in the action's unit. None: of each entry,
+    half of half its range; 0.5 if it is not bounded."""
     final_std: float | None = _for_reinforce(
         None, Range.POSITIVE, Reader.DECAY, Reader.FREE_STD, Mark.TRACED
     )
@@ -213,7 +214,8 @@ class UpdateSettings:
     maximum."""
     max_kl: float | None = _for_reinforce(None, Range.POSITIVE, Mark.TRACED)
     """Most that an update may change the policy: the mean KL divergence (nats) before and after,
-    over the visited steps, approximately. A larger change is shortened. None: no maximum."""
+    over 64 of the visited steps. A larger change is shortened, that of the observations' scale with
+    it. None: no maximum."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -6,13 +6,14 @@ from typing import Any
 
 import optax
 
-from mjx_reinforce.engine.base import Discrete, Environment, action_space, observation_size
+from mjx_reinforce.engine.base import Box, Discrete, Environment, action_space, observation_size
 from mjx_reinforce.engine.checks import check_kind, explain
 from mjx_reinforce.engine.contract import check_environment
 from mjx_reinforce.engine.devices import Devices
 from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.learning import estimators, schedules
 from mjx_reinforce.learning.contract import check_horizon
+from mjx_reinforce.learning.distributions import default_std
 from mjx_reinforce.learning.estimators import Estimator
 from mjx_reinforce.learning.learner import Learner, reinforce
 from mjx_reinforce.learning.natural_gradient import natural_gradient
@@ -103,7 +104,7 @@ def build_reinforce(env: Environment, config: Config, **shared: Any) -> Learner:
     return reinforce(
         env,
         estimator=_build_estimator(config, shared["horizon"]),
-        optimizer=_build_optimizer(config),
+        optimizer=_build_optimizer(config, action_space(env)),
         update=_build_update(config, shared["policy"]),
         num_episodes=config.num_episodes,
         entropy_cost=config.entropy_cost,
@@ -160,7 +161,7 @@ def _build_value_baseline(config: Config, horizon: int) -> Estimator:
     )
 
 
-def _build_optimizer(config: Config) -> optax.GradientTransformation:
+def _build_optimizer(config: Config, space: Box | Discrete) -> optax.GradientTransformation:
     rate = config.learning_rate
     final = rate / 10 if config.final_learning_rate is None else config.final_learning_rate
     optimizer = make_optimizer(
@@ -175,7 +176,10 @@ def _build_optimizer(config: Config) -> optax.GradientTransformation:
     optimizer = optax.chain(optimizer, schedules.decay_rate(final / config.learning_rate, length))
     if config.final_std is None:
         return optimizer
-    ratio = config.final_std / config.initial_std
+    initial_std = config.initial_std
+    if initial_std is None and isinstance(space, Box):
+        initial_std = default_std(space)
+    ratio = config.final_std / initial_std
     return optax.chain(optimizer, schedules.shrink_std(ratio, length))
 
 

@@ -144,7 +144,6 @@ REFUSED = {
     "--env CartPole-v1 --initial-std 0.3": "--initial-std 0.3 would do nothing",
     "--env CartPole-v1 --policy normal": "continuous action space",
     "--env Survive-v0 --policy categorical": "discrete action space",
-    "--update natural-gradient --max-kl 0.1 --policy tanh-normal": "whose KL divergence is known",
     "--env os:path": "'os:path' is not a class or function, but of type module",
     "--env nowhere:X": "No module named 'nowhere'",
     "--env os:Nowhere": "has no attribute 'Nowhere'",

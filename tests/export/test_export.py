@@ -58,7 +58,7 @@ def test_the_exported_policy_acts_as_ours(tmp_path, monkeypatch, capsys, family,
     assert module.SEED == 1
     expected = player.act(OBSERVATIONS)
     actions = module.act(OBSERVATIONS)
-    assert ("not clipped: clip to" in module.__doc__) == (HEADS[family] == "mean")
+    assert ("are clipped to" in module.__doc__) == (HEADS[family] == "clip")
     assert actions.shape == expected.shape
     if family == "categorical":
         np.testing.assert_array_equal(actions, expected)

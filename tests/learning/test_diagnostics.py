@@ -144,8 +144,8 @@ def test_a_change_without_a_kl_is_kept_as_it_is():
     policy = mlp_policy(1, normal(Survive.action_space), ())
     actor = Actor(params=policy.init(jax.random.key(0)), normalizer=normalize.init(1))
     visited = diagnostics.visited_steps(make_trajectory([4, 9], 20))
-    same = diagnostics.within_kl(policy, actor, actor.params, visited, 0.01)
-    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), same, actor.params))
-    broken = jax.tree.map(lambda x: x * jnp.nan, actor.params)
-    kept = diagnostics.within_kl(policy, actor, broken, visited, 0.01)
+    same = diagnostics.within_kl(policy, actor, actor, visited, 0.01)
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), same, actor))
+    broken = actor.replace(params=jax.tree.map(lambda x: x * jnp.nan, actor.params))
+    kept = diagnostics.within_kl(policy, actor, broken, visited, 0.01).params
     assert all(np.isnan(x).all() for x in jax.tree.leaves(kept))  # for ``keep_finite`` to see

@@ -275,7 +275,9 @@ def test_deterministic_has_no_density():
         distribution.log_prob(outputs, outputs)
 
 
-@pytest.mark.parametrize("name", ["normal", "normal-softplus", "categorical"])
+@pytest.mark.parametrize(
+    "name", ["normal", "normal-softplus", "tanh-normal", "truncated-normal", "categorical"]
+)
 def test_the_divergence_is_the_mean_log_ratio(name):
     distribution = build(name, ARMS if name in DISCRETE else SPACE)
     one = some_outputs(distribution)

@@ -268,7 +268,7 @@ def test_settings_become_the_schedules_they_name():
 
     def changes(**settings):
         config = Config(optimizer="sgd", learning_rate=0.1, max_grad_norm=None, **settings)
-        optimizer = _build_optimizer(config)
+        optimizer = _build_optimizer(config, Survive.action_space)
         state, found = optimizer.init(params), []
         for now in (clock(0.0, 0.0), clock(0.25, 50.0), clock(0.5, 100.0)):
             change, state = optimizer.update(params, state, params, clock=now)
