@@ -182,7 +182,7 @@ def _turned(turn: str, rng: np.random.Generator) -> Rotation:
     """Returns how the second geom is turned against the first."""
     right = Rotation.create_group("O")[int(rng.integers(24))]
     if turn == "any":
-        return Rotation.random(random_state=rng)
+        return Rotation.from_quat(rng.normal(size=4))
     if turn == "about an axis":
         axis = np.eye(3)[rng.integers(3)]
         return Rotation.from_rotvec(rng.uniform(-np.pi, np.pi) * axis) * right
@@ -224,7 +224,7 @@ def draw(
     room = halves.min(axis=0)
     aside = {"coaxial": 0, "concentric": 0, "inside": 0.6}.get(place, 1.0)
     at = aside * rng.uniform(-1, 1, 3) * (room if place == "inside" else halves.max(axis=0))
-    whole = Rotation.identity() if rng.random() < 0.3 else Rotation.random(random_state=rng)
+    whole = Rotation.identity() if rng.random() < 0.3 else Rotation.from_quat(rng.normal(size=4))
     mats = np.stack([whole.as_matrix(), (whole * _turned(turn, rng)).as_matrix()])
     mats = np.where(np.abs(mats - mats.round()) < 1e-15, mats.round(), mats)
 

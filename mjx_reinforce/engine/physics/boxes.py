@@ -302,7 +302,7 @@ def _meet_at_face(
 
     back = jnp.array([[across[1, 1], -across[1, 0]], [-across[0, 1], across[0, 0]]]) / determinant
     around = jnp.where(determinant < 0, np.array([-1, 1]), 1)
-    corners = (_CORNERS * around * half - center[:2]) @ back.T
+    corners = (jnp.asarray(_CORNERS) * around * half - center[:2]) @ back.T
     sides = jnp.roll(corners, -1, axis=0) - corners
     enters, meets_back = _entry(corners, sides, jnp.ones(2))
     of_own = center + (corners + enters[:, None] * sides) @ across

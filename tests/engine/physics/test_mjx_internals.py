@@ -55,6 +55,8 @@ SOURCES = {
     "solver.solve": ("e052e9cdd4255a97", "newton.solve_newton"),
     "smooth.solve_m": ("58a57c2a3ed4519f", "limits.solve_limits"),
     "collision_driver.collision": ("0b7104d7b1479df8", "mjx_internals.collision_with"),
+    "collision_driver.make_condim": ("86d240a22d3c85f7", "mjx_internals.data_with"),
+    "io._make_data_jax": ("afc76c1461124fe9", "mjx_internals.data_with"),
     "collision_primitive.collider": ("061f1d27d48505fb", "contacts (what they take)"),
     "constraint._efc_contact_pyramidal": ("4eb189a3cefeb465", "rows.make_constraint"),
     "constraint._efc_contact_frictionless": ("1aff58c6bce64b04", "rows.make_constraint"),
