@@ -91,6 +91,12 @@ def _pushed(model: Any) -> dict[str, Start]:
     return starts
 
 
+def _close(model: Any) -> dict[str, Start]:
+    """Returns the starts of ``_pushed`` that are not deep in the floor."""
+    starts = _pushed(model)
+    return {name: starts["near" if "near" in name else "at its pose"] for name in starts}
+
+
 def _actuated(model: Any) -> dict[str, Start]:
     """Returns starts of a pendulum."""
     return {
@@ -209,7 +215,8 @@ def mechanisms() -> Iterator[Mechanism]:
         searched |= {name: _mjcf("walker", **parts) for name, parts in _TABLES["walkers"].items()}
         for name, plain in searched.items():
             xml = plain.replace("<option ", f"<option {limits} ")
-            yield Mechanism("iterations", limits, name, xml, _pushed, 20)
+            starts = _close if name in _TABLES["walkers"] else _pushed
+            yield Mechanism("iterations", limits, name, xml, starts, 20)
 
 
 def failures() -> list[Mechanism]:
