@@ -45,7 +45,7 @@ from mujoco.mjx._src import (
 advance = forward._advance
 collider = collision_primitive.collider
 geom_pairs = collision_driver.geom_pairs
-has_collider = collision_driver.has_collision_fn
+has_collider = cast(Callable[[int, int], bool], collision_driver.has_collision_fn)
 make_frame, quat_mul_axis = math.make_frame, math.quat_mul_axis
 kbi = constraint._kbi
 muscle_gain = support.muscle_gain
