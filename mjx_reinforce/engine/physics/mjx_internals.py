@@ -131,8 +131,8 @@ def wrap_points(
             parts.append(wrap(*(x[chosen] for x in of_each)))
             order.append(chosen)
     inverse = np.argsort(np.concatenate(order))
-    length, *points = (jnp.concatenate(x)[inverse] for x in zip(*parts, strict=True))
-    return length.reshape(-1) >= 0, *points
+    length, first, last = (jnp.concatenate(x)[inverse] for x in zip(*parts, strict=True))
+    return length.reshape(-1) >= 0, first, last
 
 
 _Colliders = dict[tuple[mjx.GeomType, mjx.GeomType], Callable[..., Any]]

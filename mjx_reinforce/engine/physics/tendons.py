@@ -3,7 +3,7 @@
 A tendon pulls, or pushes, at each end of each straight piece of its path, along the piece.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +44,8 @@ def body_forces(model: mjx.Model, data: mjx.Data) -> jax.Array:
       data: its data after the constraints were solved.
     """
     parts = zip(_JOIN, zip(*_pieces(model, data), strict=True), strict=True)
-    ends = _Ends(*(join(part) for join, part in parts))
+    joined: list[Any] = [join(part) for join, part in parts]
+    ends = _Ends(*joined)
     along = ends.at - ends.toward
     length = jnp.linalg.norm(along, axis=1, keepdims=True)
     along = jnp.where(length < mjMINVAL, jnp.eye(3)[0], along / jnp.maximum(length, mjMINVAL))
