@@ -188,6 +188,7 @@ def test_a_ready_policy_may_be_trained():
 
 def test_a_csv_file_grows_by_whole_rows(tmp_path):
     path = tmp_path / "table.csv"
+    path.touch()
     for rows in ([["a", "b"]], [[1, 0.1], ["x,y", None]], [[2, 1e-30]]):
         append(path, csv_text(rows).encode())
     assert path.read_bytes() == b'a,b\n1,0.1\n"x,y",\n2,1e-30\n'
@@ -196,7 +197,7 @@ def test_a_csv_file_grows_by_whole_rows(tmp_path):
 def test_a_full_disk_leaves_no_half_row(tmp_path):
     """A limit on the size of files fails as a full disk does: after a part was written."""
     path = tmp_path / "table.csv"
-    append(path, b"a\n1\n")
+    path.write_bytes(b"a\n1\n")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (7, hard))
     try:
