@@ -67,7 +67,7 @@ def test_the_exported_policy_acts_as_ours(tmp_path, monkeypatch, capsys, family,
         np.testing.assert_allclose(actions, expected, rtol=1e-6, atol=1e-6)
     one = module.act(OBSERVATIONS[0])
     np.testing.assert_allclose(one, expected[0], rtol=1e-6, atol=1e-6)
-    if HEADS[family] == "clip":
+    if HEADS[family] == "clip" and case == "linear":
         at_a_bound = (expected == BOX["action_low"]) | (expected == BOX["action_high"])
         assert at_a_bound.any()
         assert not at_a_bound.all()
