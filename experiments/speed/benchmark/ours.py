@@ -11,11 +11,10 @@ from flax import struct
 from mujoco import mjx
 
 from experiments.speed.benchmark.rows import Candidate
-from mjx_reinforce import Actor, act, envs, mlp_policy
-from mjx_reinforce.engine.base import action_space, observation_size
+from mjx_reinforce import Actor, act, categorical, envs, mlp_policy, normal
+from mjx_reinforce.engine.base import Discrete, action_space, observation_size
 from mjx_reinforce.engine.play.choice import ActingPolicy, choose
 from mjx_reinforce.learning import normalize
-from mjx_reinforce.learning.distributions import default_distribution
 
 #: Name in the table -> engine.
 ENGINES = {"plain MJX": "vmap", "native": "native"}
@@ -70,7 +69,11 @@ def rollout_of(
         task._physics_step = partial(mjx.step, task.model)
     env = Loop(task, steps)
     size = observation_size(env)
-    network = mlp_policy(size, default_distribution(action_space(env)), (16, 32))
+    space = action_space(env)
+    # The noise decides how soon a robot falls; it is that of all rows so far, in the action's unit.
+    noisy = partial(normal, initial_std=0.5)
+    distribution = (categorical if isinstance(space, Discrete) else noisy)(space)
+    network = mlp_policy(size, distribution, (16, 32))
     actor = Actor(params=network.init(jax.random.key(0)), normalizer=normalize.init(size))
     play_act = partial(act, network)
     began = time.perf_counter()
