@@ -63,10 +63,11 @@ def capsule_box(capsule: GeomInfo, box: GeomInfo) -> Collision:
     center = (capsule.pos - box.pos) @ box.mat
     reach = capsule.mat[:, 2] @ box.mat * capsule.size[1]
     first, second = _along_capsule(center, reach, capsule, box.size)
-    places = jnp.stack([first, jnp.where(jnp.isfinite(second), first + second, first)])
-    centers = center + places[:, None] * reach
+    places = jnp.stack([first, first + second])
+    none = ~jnp.isfinite(places)
+    # Also where no contact is, all is finite: the solver multiplies it by zero.
+    centers = center + jnp.where(none, 0, places)[:, None] * reach
     dist, pos, frame = jax.vmap(lambda x: _ball_on_box(x, capsule.size[0], box))(centers)
-    none = ~jnp.isfinite(jnp.stack([first, second]))
     return jnp.where(none, FAR, dist), pos, frame
 
 
