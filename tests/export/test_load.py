@@ -202,6 +202,8 @@ DAMAGE = {
     "no axis of seeds": (arrays(normalizer__count=lambda x: x[0]), NPZ, "make it float32[1"),
     "complex": (arrays(**{KERNEL: lambda x: x + 0j}), NPZ, "kernel is complex64[3, 4, 8], and"),
     "whole numbers": (arrays(**{KERNEL: lambda x: x.astype(int)}), NPZ, "is int64[3, 4, 8], and"),
+    "another byte order": (arrays(**{KERNEL: lambda x: x.astype(">f4")}), NPZ, "is >f4[3, 4, 8]"),
+    "long numbers": (arrays(**{KERNEL: lambda x: x.astype("longdouble")}), NPZ, "is float128[3"),
     "text": (arrays(**{KERNEL: lambda x: x.astype("U9")}), NPZ, "is <U9[3, 4, 8], and"),
     "beyond float32": (
         arrays(**{KERNEL: lambda x: np.full(x.shape, 1e300)}),
