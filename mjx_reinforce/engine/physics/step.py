@@ -99,8 +99,8 @@ def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = contacts.fwd_position(model, data)
     data = mjx.sensor_pos(model, data)
     data = mjx.fwd_velocity(model, data)
-    if model.opt.disableflags & mjx.DisableBit.ACTUATION:  # C leaves the sensors' source at zero
-        data = data.replace(actuator_velocity=jnp.zeros_like(data.actuator_velocity))
+    if model.opt.disableflags & mjx.DisableBit.ACTUATION:  # C then leaves the velocities at zero
+        data = with_fields(data, actuator_velocity=jnp.zeros(model.nu, data.qvel.dtype))
     data = mjx.sensor_vel(model, data)
     data = mjx.fwd_actuation(model, data)
     data = inertia.fwd_acceleration(model, data)

@@ -93,6 +93,11 @@ CASES |= {
     "no contacts": {
         "sensor": '<touch site="tip"/><contact geom1="lower" num="2" data="found force"/>'
     },
+    "no actuation": {
+        "actuator": '<motor name="m" joint="b"/>',
+        "flags": '<flag actuation="disable"/>',
+        "sensor": '<actuatorvel actuator="m"/><actuatorpos actuator="m"/>',
+    },
     "cutoff": {"sensor": '<framelinacc objtype="site" objname="tip" cutoff=".5"/>'},
 }
 
