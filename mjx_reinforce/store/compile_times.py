@@ -13,7 +13,7 @@ from mjx_reinforce.settings.defaults import num_cores
 
 #: What decides how long they take, of the settings.
 _DECISIVE = ("env", "env_set", "algorithm", "engine", "hidden_sizes", "estimator", "update")
-#: Of nearly all of the package's tasks, on two quiet CPU cores and on an H100.
+#: Of most of the package's tasks, on two CPU cores and on a GPU, roughly.
 _FIRST = "usually 5 to 40 s on a quiet machine"
 
 
