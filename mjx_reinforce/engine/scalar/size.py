@@ -85,5 +85,5 @@ def _equation_size(eqn: Any, default: Mapping[Any, int | None]) -> int:
 
 
 def _entries(atoms: Any) -> int:
-    """Returns how many entries arrays have: a loop stores and loads each of what it goes through."""
+    """Returns how many entries arrays have, of which a loop stores and loads each."""
     return sum(math.prod(atom.aval.shape) for atom in atoms)

@@ -19,7 +19,6 @@ from mujoco import mjx
 from scipy.spatial.transform import Rotation
 
 from experiments.checks import contacts as checks
-
 from mjx_reinforce.engine.physics import contacts, mjx_internals
 from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.envs import models
