@@ -142,8 +142,11 @@ class TwoGeoms:
 
     def by_us(self, poses: list[Pose]) -> list[np.ndarray]:
         """Returns our contacts of each pose, [K, 13]; raises ValueError if they are refused."""
-        found = np.asarray(self._collide(*map(np.stack, zip(*poses, strict=True))))
-        return [x[x[:, 0] < self.margin] for x in found]
+        return [x[x[:, 0] < self.margin] for x in self.slots(poses)]
+
+    def slots(self, poses: list[Pose]) -> np.ndarray:
+        """Returns the contacts of each pose, [poses, N, 13], those that are none included."""
+        return np.asarray(self._collide(*map(np.stack, zip(*poses, strict=True))))
 
 
 def _bound(kind: str, size: np.ndarray) -> float:

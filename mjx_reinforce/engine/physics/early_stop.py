@@ -23,6 +23,7 @@ from mujoco import mjx
 
 from mjx_reinforce.engine.physics import newton
 from mjx_reinforce.engine.physics.mjx_internals import jax_fields
+from mjx_reinforce.engine.scalar import is_written_out, short_scan
 
 #: Fewer are few: in the mechanisms of ``experiments/checks/matrix.py`` C takes 6 steps at most, and
 #: evaluates 22 lengths at most for one. Gymnasium's Pusher allows 20 steps; MuJoCo's default is 50
@@ -61,7 +62,8 @@ class _Islands(NamedTuple):
         """Gives each degree of freedom or row what its island has; without one, zero."""
         if self.count == 1:
             return values[0]
-        return jnp.append(values, jnp.zeros_like(values[:1]))[labels]
+        members = labels == jnp.arange(self.count)[:, None]
+        return jnp.sum(jnp.where(members, values[:, None], 0), 0)  # machine code has no lookups
 
 
 class _Mark(NamedTuple):
@@ -181,8 +183,15 @@ def _islands(model: mjx.Model, jacobian: jax.Array) -> _Islands:
     count = int(trees.max()) + 1
     if count == 1 or model.opt.disableflags & _NO_ISLANDS:
         return _Islands(1, np.zeros(len(trees), int), np.zeros(len(jacobian), int))
-    meets = jnp.stack([jnp.any(jacobian[:, trees == t] != 0, 1) for t in range(count)])
-    joined = jnp.any(meets[:, None] & meets[None], -1)
+
+    def join(joined: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
+        meets = jnp.stack([jnp.any(rows[:, trees == t] != 0, 1) for t in range(count)])
+        return joined | jnp.any(meets[:, None] & meets[None], -1), meets
+
+    # LLVM takes minutes for thousands of bools that are joined in one block.
+    parts = jacobian[:, None] if is_written_out() else jacobian[None]
+    joined, met = short_scan(join, jnp.zeros((count, count), bool), parts)
+    meets = jnp.moveaxis(met, 0, 1).reshape(count, -1)
     for _ in range(math.ceil(math.log2(count))):  # through one more tree, three more, ...
         joined = jnp.any(joined[:, :, None] & joined[None], 1)
     label = jnp.min(jnp.where(joined, jnp.arange(count), count), 1)
@@ -215,21 +224,20 @@ def _along(
       slope: [islands] the derivative of the cost without rows, at the start.
       curvature: [islands] its second derivative.
     """
-    force_before, cost_before = rows.force(residual), rows.cost(residual)
+    if rows.loss is not None:  # of every row, as a loop takes one after the other
+        others = (0, residual.size - rows.loss.size)
+        rows = rows._replace(loss=jnp.pad(rows.loss, others, constant_values=jnp.inf))
+    rows = rows._replace(jacobian=None, reference=None)
+    whole = rows, jnp.asarray(islands.rows), residual, change
 
     def at(length: jax.Array) -> _Mark:
-        step = islands.spread(length, islands.rows) * change
-        after = residual + step
-        force = rows.force(after)
-        # The difference of two costs has no digits where a row stays what it is.
-        work = jnp.where(
-            rows.alike(after, residual),
-            -(force_before + force) * step / 2,
-            (rows.cost(after) - cost_before) / 2,
-        )
-        stiffness = jnp.where(rows.active(after), rows.constraint_mass * change**2, 0)
-        of_rows = (islands.total(x, islands.rows) for x in (work, force * change, stiffness))
-        worked, pushed, stiff = of_rows
+        if is_written_out():  # hundreds of rows, at seven places
+            none = jnp.zeros((3, *length.shape), residual.dtype)
+            one_by_one = jax.tree.map(lambda x: x[:, None], whole)
+            add = lambda sums, row: (sums + _of_rows(islands, length, *row), None)  # noqa: E731
+            worked, pushed, stiff = short_scan(add, none, one_by_one)[0]
+        else:
+            worked, pushed, stiff = _of_rows(islands, length, *whole)
         total = curvature + stiff
         return _Mark(
             length,
@@ -239,6 +247,32 @@ def _along(
         )
 
     return at
+
+
+def _of_rows(
+    islands: _Islands,
+    length: jax.Array,
+    rows: newton.Rows,
+    labels: jax.Array,
+    residual: jax.Array,
+    change: jax.Array,
+) -> jax.Array:
+    """Returns what rows add to the cost along a step, to minus its slope and its curvature.
+
+    Arguments are those of ``_along``, and the rows' islands; the result is [3, islands].
+    """
+    step = islands.spread(length, labels) * change
+    after = residual + step
+    force = rows.force(after)
+    # The difference of two costs has no digits where a row stays what it is.
+    work = jnp.where(
+        rows.alike(after, residual),
+        -(rows.force(residual) + force) * step / 2,
+        (rows.cost(after) - rows.cost(residual)) / 2,
+    )
+    stiffness = jnp.where(rows.active(after), rows.constraint_mass * change**2, 0)
+    sums = [islands.total(x, labels) for x in (work, force * change, stiffness)]
+    return jnp.stack(sums)
 
 
 def _chosen(condition: jax.Array, yes: Any, no: Any) -> Any:

@@ -68,10 +68,9 @@ def _equation_size(eqn: Any, default: Mapping[Any, int | None]) -> int:
         bodies = (params[part] for part in ("cond_jaxpr", "body_jaxpr"))
         return _LOOP * sum(num_scalars(jaxprs.program(body)) for body in bodies)
     if name == "scan":
-        return min(_LOOP, params["length"]) * num_scalars(jaxprs.program(params["jaxpr"]))
-    made, read = (
-        sum(math.prod(atom.aval.shape) for atom in atoms) for atoms in (eqn.outvars, eqn.invars)
-    )
+        body = min(_LOOP, params["length"]) * num_scalars(jaxprs.program(params["jaxpr"]))
+        return body + _entries(eqn.invars) + _entries(eqn.outvars)
+    made, read = _entries(eqn.outvars), _entries(eqn.invars)
     if name == "dot_general":
         (contracted, _), _ = params["dimension_numbers"]
         return 2 * made * math.prod(eqn.invars[0].aval.shape[axis] for axis in contracted)
@@ -83,3 +82,8 @@ def _equation_size(eqn: Any, default: Mapping[Any, int | None]) -> int:
         return read
     program = jaxprs.callee(eqn)
     return 0 if program is None else num_scalars(program)
+
+
+def _entries(atoms: Any) -> int:
+    """Returns how many entries arrays have, of which a loop stores and loads each."""
+    return sum(math.prod(atom.aval.shape) for atom in atoms)

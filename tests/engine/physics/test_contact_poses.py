@@ -11,13 +11,16 @@ import itertools
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from mujoco import mjx
 from scipy.spatial.transform import Rotation
 
 from experiments.checks import contacts as checks
-from mjx_reinforce.engine.physics import contacts
+from mjx_reinforce.engine.physics import contacts, mjx_internals
+from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.envs import models
 
 #: Pairs whose functions are ours alone, and their margins.
@@ -72,6 +75,12 @@ def test_contacts_are_those_of_c(pair):
     assert sum(x.touches for x in sample) > 60
 
 
+def is_collided(pair):
+    """Whether MJX collides two geoms, and the product accepts it."""
+    types = tuple(mjx.GeomType[x.upper()] for x in pair)
+    return mjx_internals.has_collider(*types) and types not in contacts.UNLIKE_C
+
+
 def is_known(pair, pose):
     """Parallel capsules and cylinders sunk in a plane, see contacts.py."""
     if pair == ("capsule", "capsule"):
@@ -102,3 +111,53 @@ def test_margins_of_boxes(pair):
             models.to_mjx(model, "pair")
     else:
         models.to_mjx(model, "pair")
+
+
+#: Under elliptic cones MJX's solver multiplies all contacts, also those that are none, by zero.
+ELLIPTIC = """
+<mujoco>
+  <option cone="elliptic" timestep=".004" tolerance="0"/>
+  <worldbody>
+    <geom type="box" size=".3 .3 .1"/>
+    <body pos="0 0 .199"><freejoint/><geom type="box" size=".1 .12 .1"/></body>
+    <body pos=".6 0 .3" euler="0 20 30"><freejoint/>
+      <geom type="capsule" size=".03 .1"/><geom pos="0 .1 0" size=".04"/></body>
+    <body pos="0 .21 .129" euler="0 90 0"><freejoint/><geom type="capsule" size=".03 .1"/></body>
+  </worldbody>
+</mujoco>"""
+
+
+def test_elliptic_cones_with_contacts_that_are_none():
+    model = mujoco.MjModel.from_xml_string(ELLIPTIC)
+    data = mujoco.MjData(model)
+    with jax.enable_x64(True):
+        converted = models.to_mjx(model, "boxes")
+        start = models.make_data(model)
+        step = jax.jit(jax.vmap(functools.partial(physics.step, converted)))
+        ours = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), start)
+        touching = 0
+        for _ in range(15):
+            mujoco.mj_step(model, data)
+            ours = step(ours)
+            touching = max(touching, data.ncon)
+            for qpos, qvel in zip(ours.qpos, ours.qvel, strict=True):
+                np.testing.assert_allclose(qpos, data.qpos, atol=1e-7)
+                np.testing.assert_allclose(qvel, data.qvel, atol=1e-6)
+    assert touching >= 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "pair",
+    [x for x in itertools.combinations_with_replacement(checks.TYPES, 2) if is_collided(x)],
+    ids="-".join,
+)
+def test_contacts_that_are_none_are_finite(pair):
+    """The solver reads their places and frames as well."""
+    with jax.enable_x64(True):
+        geoms = checks.TwoGeoms(*pair)
+        shown = geoms.slots([x.pose for x in checks.outcomes(geoms, 1, seed=6)])
+    frames = shown[..., 4:].reshape(-1, 3, 3)
+    products = frames @ frames.transpose(0, 2, 1)
+    assert np.isfinite(shown).all()
+    np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), products.shape), atol=1e-6)
