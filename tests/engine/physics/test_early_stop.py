@@ -93,15 +93,35 @@ def test_limits_end_where_c_does():
     assert error < 1e-9 < 1e-6 < far
 
 
+def strayed(mechanism, start):
+    """Returns how far C strays from itself if its start moves by 1e-12."""
+    model = mujoco.MjModel.from_xml_string(mechanism.xml)  # pyright: ignore
+    qpos, qvel, *others = mechanism.starts[start]
+    moved = qvel + 1e-12 * np.random.default_rng(0).standard_normal(qvel.shape)
+    both = (matrix.by_c_as_is(model, (qpos, x, *others), mechanism.steps) for x in (qvel, moved))
+    return max(
+        np.max(np.abs(x - y) / np.maximum(1, np.abs(y)), initial=0)
+        for x, y in zip(*both, strict=True)
+    )
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("limits", [FEW.format(1, 5), FEW.format(3, 5)])
 def test_walkers_among_balls_end_where_c_does(limits):
-    """Two walkers and what lies about them: contacts, limits, friction loss, many islands."""
-    chosen = [x for x in mechanisms() if x.title[:2] == ("iterations", limits) and "legs" in x.name]
+    """Two walkers and what lies about them: contacts, limits, friction loss, many islands.
+
+    One step of the solver a time step lets rounding grow, in C by up to a million.
+    """
+    chosen = {
+        each.name: each
+        for each in mechanisms()
+        if each.title[:2] == ("iterations", limits) and "legs" in each.name
+    }
     with jax.enable_x64(True):
-        cells = list(matrix.compare(chosen))
+        cells = list(matrix.compare([*chosen.values()]))
     assert len(cells) == 4 * len(chosen) == 8
-    assert max(cell.error for cell in cells) < 1e-9
+    for cell in cells:
+        assert cell.error < max(1e-9, strayed(chosen[cell.mechanism], cell.start)), cell
 
 
 @pytest.mark.parametrize(
