@@ -14,7 +14,7 @@ from mujoco import MjModel, MjSpec, mjx  # pyright: ignore[reportAttributeAccess
 
 from mjx_reinforce.engine.checks import BadEnvironmentError, explain
 from mjx_reinforce.engine.physics import contacts
-from mjx_reinforce.envs.refusals import check_meshes, check_supported, is_off
+from mjx_reinforce.envs.refusals import check_supported, is_off
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco
@@ -160,5 +160,4 @@ def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
         jax.eval_shape(lambda: make_data(model))
     except Exception as error:  # of another library: no refusal
         raise BadEnvironmentError(f"converting {name} to MJX fails: {explain(error)}") from error
-    check_meshes(converted, model, name)
     return converted

@@ -11,7 +11,6 @@ from mjx_reinforce.engine.checks import BadEnvironmentError
 from mjx_reinforce.engine.physics.contacts import UNLIKE_C, UNLIKE_C_WITHIN_MARGIN
 from mjx_reinforce.engine.physics.early_stop import stops_early
 from mjx_reinforce.engine.physics.mjx_internals import (
-    convex_meshes,
     geom_groups,
     geom_pairs,
     has_collider,
@@ -107,22 +106,6 @@ def check_supported(model: MjModel, name: str, *others: str) -> None:
     if reasons:
         listed = "".join(f"\n  {i}. {reason}" for i, reason in enumerate(reasons, start=1))
         raise UnsupportedError(f"MJX cannot run {name}, for {len(reasons)} reasons:{listed}")
-
-
-def check_meshes(converted: mjx.Model, model: MjModel, name: str) -> None:
-    """Checks that MJX sees edges of each mesh that may touch something.
-
-    Raises:
-      UnsupportedError: it sees none, since a mesh is flat.
-    """
-    flat = [
-        model.mesh(i).name for i, mesh in convex_meshes(converted).items() if not len(mesh.edge)
-    ]
-    if flat:
-        remedy = "make them thicker, or replace them by boxes"
-        raise UnsupportedError(
-            f"MJX cannot run {name}: MJX sees no edges of flat meshes ({_listed(flat)}); {remedy}"
-        )
 
 
 def is_off(model: MjModel, flag: str) -> bool:

@@ -93,12 +93,6 @@ def geom_groups(model: mjx.Model) -> Iterator[tuple[int, int, int]]:
             yield int(key.condim), first, second
 
 
-def convex_meshes(model: mjx.Model) -> dict[int, Any]:
-    """Returns MJX's convex meshes, of those that may touch something, by their numbers."""
-    meshes = cast(Any, model)._impl.mesh_convex
-    return {number: mesh for number, mesh in enumerate(meshes) if mesh is not None}
-
-
 def has_friction(model: mjx.Model) -> np.ndarray:
     """Returns which tendons have rows of friction loss, [ntendon]."""
     return cast(mjx.ModelJAX, model._impl).tendon_hasfrictionloss
