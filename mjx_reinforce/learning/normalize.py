@@ -70,19 +70,34 @@ def update(
     m2 = jnp.sum(jnp.where(kept, (observation - mean) ** 2, 0.0), axis=(0, 1))
     total = jnp.maximum(normalizer.count + count, 1.0)
     delta = mean - normalizer.mean
-    before = normalizer.m2 / jnp.maximum(normalizer.count, 1.0)
-    # What a count of this size is rounded by would tell in the ratio of two long sums: a batch then
-    # moves the variance by the share that it has in the count as it is kept.
-    share = (normalizer.count + count - normalizer.count) / total
-    apart = m2 / divisor + delta**2 * normalizer.count / total - before
-    moved = (before + share * apart) * total
+    # XLA would compile the sums below otherwise beside ``_moved``, and round them otherwise.
+    apart = jax.lax.optimization_barrier((normalizer, count, delta, m2))
     m2 = normalizer.m2 + m2 + delta**2 * normalizer.count * count / total
-    m2 = jnp.where(total > _EXACT, moved, m2)
+    m2 = jnp.where(total > _EXACT, _moved(*apart), m2)
     return Normalizer(
         count=normalizer.count + count,
         mean=normalizer.mean + delta * count / total,
         m2=jnp.maximum(m2, min_std**2 * (normalizer.count + count)),
     )
+
+
+def _moved(normalizer: Normalizer, count: jax.Array, delta: jax.Array, m2: jax.Array) -> jax.Array:
+    """Returns the sum of squares [O] of a long count and a batch, whose count is rounded.
+
+    That rounding would tell in the ratio of two long sums: a batch moves the variance by the share
+    that it has in the count as it is kept.
+
+    Args:
+      normalizer: the statistics so far.
+      count: [] of the batch.
+      delta: [O] its mean minus theirs.
+      m2: [O] its sum of squares.
+    """
+    total = jnp.maximum(normalizer.count + count, 1.0)
+    before = normalizer.m2 / jnp.maximum(normalizer.count, 1.0)
+    share = (normalizer.count + count - normalizer.count) / total
+    apart = m2 / jnp.maximum(count, 1.0) + delta**2 * normalizer.count / total - before
+    return (before + share * apart) * total
 
 
 def between(before: Normalizer, after: Normalizer, share: jax.Array) -> Normalizer:

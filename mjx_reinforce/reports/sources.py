@@ -293,6 +293,8 @@ def _read_curves(directory: Path) -> dict[str, np.ndarray]:
         shapes = {name: x.shape[-1:] for name, x in found.items()}
         if len({*shapes.values()}) > 1 or len(found["eval_return"]) != len(found["env_steps"]):
             raise ValueError(f"its arrays are of different runs: {shapes}")
+        if not len(found["env_steps"]):
+            raise ValueError("it has no evaluations")
         _check_steps(found["env_steps"])
         return found
 

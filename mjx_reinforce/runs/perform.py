@@ -22,6 +22,7 @@ except ImportError as error:
 from mjx_reinforce import envs
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
+from mjx_reinforce.files import check_place
 from mjx_reinforce.runs.design import Design, check_design
 from mjx_reinforce.training.resume import read_record
 
@@ -81,7 +82,9 @@ def remove_empty(folders: Sequence[Path]) -> None:
 
 
 @contextlib.contextmanager
-def own_directory(directory: Path, interrupt: Interrupt, *, resumed: bool) -> Iterator[None]:
+def own_directory(
+    directory: Path, interrupt: Interrupt, *, resumed: bool
+) -> Iterator[os.stat_result]:
     """Makes the directory of a run or sweep, and keeps other processes out of it.
 
     Folders that were made and stay empty are removed at the end.
@@ -90,6 +93,9 @@ def own_directory(directory: Path, interrupt: Interrupt, *, resumed: bool) -> It
       directory: of it.
       interrupt: also removes them.
       resumed: whether it goes on there.
+
+    Yields:
+      What tells the directory from another in its place, see ``files.check_place``.
 
     Raises:
       ValueError: it is not empty, is in that of another run, cannot be written, or is another
@@ -105,6 +111,7 @@ def own_directory(directory: Path, interrupt: Interrupt, *, resumed: bool) -> It
             held.enter_context(locked(directory))  # a folder in which another trains stays
             if not resumed:
                 _check_unbegun(directory)  # not before: another may have been quicker
+            place = directory.stat()
         except OSError as error:
             remove_empty(made)
             full = error.errno in _FULL
@@ -115,7 +122,7 @@ def own_directory(directory: Path, interrupt: Interrupt, *, resumed: bool) -> It
             ) from error
         interrupt.on_exit(lambda: remove_empty(made))
         try:
-            yield
+            yield place
         finally:
             remove_empty(made)
 
@@ -183,8 +190,9 @@ def perform(
     check_design(design)
     with contextlib.ExitStack() as held:
         directory, resumed = design.directory if files else None, design.base.resume is not None
+        place = None
         if directory is not None:
-            held.enter_context(own_directory(directory, interrupt, resumed=resumed))
+            place = held.enter_context(own_directory(directory, interrupt, resumed=resumed))
         known = read_record(design.directory) if resumed else {}
         if known.get("status") == "finished":  # of a sweep
             return Outcome(directory, known, None, {}, _display(quiet=quiet))
@@ -211,7 +219,10 @@ def perform(
         display.say(describe_compiling(first, design.over))
         with display:
             kind = SweepFiles if design.over else RunFiles
-            written = None if directory is None else kind(directory, prepared, display.say)
+            written = None
+            if directory is not None and place is not None:
+                check_place(directory, place)  # writing the simulation out took its time
+                written = kind(directory, prepared, display.say)
             driver, summary = conduct(prepared, written, display, observers, interrupt)
         return Outcome(directory, summary, driver, prepared.parts[0].ready.policy, display)
 

@@ -146,7 +146,7 @@ def test_numbers_have_a_few_digits_and_what_is_not_finite_is_none():
         3,
     ]
     assert charts.short(0.123456789, 2) == [0.12]
-    assert [type(x) for x in charts.short([2.0, 2.5])] == [int, float]
+    assert [type(x) for x in charts.short([2.0, 2.5, 1e20])] == [int, float, float]
 
 
 def test_tables_stand_below_each_other():

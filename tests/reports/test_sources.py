@@ -130,3 +130,12 @@ def test_what_cannot_be_compared_is_refused(tmp_path):
     ):
         with pytest.raises(ValueError, match=said):
             sources.read_experiment(directories)
+
+
+def test_a_sweep_without_evaluations_is_damaged(tmp_path):
+    sweep = make_sweep(tmp_path / "none", num_seeds=2, evaluations=2)
+    arrays = dict(np.load(sweep / "curves.npz"))
+    arrays |= {name: arrays[name][:0] for name in ("eval_return", "env_steps")}
+    np.savez(sweep / "curves.npz", **arrays)
+    with pytest.raises(ValueError, match=r"curves\.npz is damaged: it has no evaluations"):
+        sources.read_experiment([sweep])

@@ -8,7 +8,7 @@ import pytest
 
 from mjx_reinforce import train
 from mjx_reinforce.report import WrittenReport
-from mjx_reinforce.runs import command_line, saving
+from mjx_reinforce.runs import command_line, plan, saving
 from mjx_reinforce.runs.saving import Files, RunFiles, SweepFiles
 from mjx_reinforce.training import driver
 
@@ -68,6 +68,15 @@ def test_it_ends_while_it_trains(run, monkeypatch, capsys, command, loss):
     main, arguments = COMMANDS[command]
     lose(monkeypatch, Files, "updated", 3, LOSSES[loss])
     check_lost(run(*arguments, command=main), loss, capsys)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", COMMANDS)
+def test_it_ends_before_it_trains(run, monkeypatch, capsys, command):
+    """Where another run began in its place while this one wrote its simulation out."""
+    main, arguments = COMMANDS[command]
+    lose(monkeypatch, plan, "prepare", 1, replace)
+    check_lost(run(*arguments, command=main), "replaced", capsys)
 
 
 @pytest.mark.slow

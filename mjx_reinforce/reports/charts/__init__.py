@@ -90,6 +90,10 @@ def rows(table: Table, labels: Sequence[str]) -> list[dict[str, Any]]:
     return listed
 
 
+#: Floats beyond have no fractions.
+_SHORT = 2.0**53
+
+
 def short(values: ArrayLike, digits: int = 5) -> list[Any]:
     """Returns numbers with a few digits, None where they are not finite."""
     flat = np.asarray(values, float).ravel().tolist()
@@ -97,7 +101,8 @@ def short(values: ArrayLike, digits: int = 5) -> list[Any]:
 
 
 def _integer(value: float) -> float | int:
-    return int(value) if value.is_integer() else value
+    """Returns an int where it is short; the drawing program reads none beyond 64 bits."""
+    return int(value) if value.is_integer() and abs(value) < _SHORT else value
 
 
 def means(results: Sequence[Result]) -> Table:
