@@ -304,7 +304,9 @@ class _Reinforce:
         proposed = Actor(params=params, normalizer=normalizer)
         actor = diagnostics.within_kl(self.policy, before, proposed, visited, self.max_kl)
         after = state.replace(actor=actor, opt_state=opt_state, estimator_state=estimator_state)
-        after, skipped = keep_finite(after, state)
+        # A norm that overflows would make a step of nothing.
+        sound = jnp.isfinite(measured.get("gradient_norm", 0.0))
+        after, skipped = keep_finite(after, state, sound)
 
         change = diagnostics.policy_metrics(self.policy, before, after.actor, visited)
         return after, update_metrics(trajectory, skipped, metrics | measured | change)
@@ -369,8 +371,10 @@ def train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics
     return _step(learner, state)
 
 
-def keep_finite(learned: TrainState, before: TrainState) -> tuple[TrainState, jax.Array]:
-    """Returns ``learned`` and 0 if all of it is finite, else ``before`` and 1.
+def keep_finite(
+    learned: TrainState, before: TrainState, sound: jax.Array | bool = True
+) -> tuple[TrainState, jax.Array]:
+    """Returns ``learned`` and 0 if all of it is finite and sound, else ``before`` and 1.
 
     So an update that breaks costs its seed that one update.
     """
@@ -378,7 +382,7 @@ def keep_finite(learned: TrainState, before: TrainState) -> tuple[TrainState, ja
     # backend makes a program for each, and each of them computes again what they share.
     new, unravel = ravel_pytree(list(filter(is_float, jax.tree.leaves(learned))))
     old, _ = ravel_pytree(list(filter(is_float, jax.tree.leaves(before))))
-    finite = jnp.all(jnp.isfinite(new))
+    finite = jnp.all(jnp.isfinite(new)) & sound
     floats = iter(unravel(jnp.where(finite, new, old)))
 
     def choose(x: jax.Array, y: jax.Array) -> jax.Array:
