@@ -83,9 +83,10 @@ def tanh_normal(
     middle, half = middle_and_half_range(layout.box)
     least, initial = _LEAST_TANH_STD * half, layout.initial_std
     if isinstance(initial, np.ndarray) and np.any(initial < least):
+        shown = [float(f"{x:.6g}") for x in least]
         raise ValueError(
             f"tanh-normal needs an initial_std of {_LEAST_TANH_STD} of half the action's range or "
-            f"more, here {least.tolist()}, got {initial.tolist()}; or choose truncated-normal"
+            f"more, here {shown}, got {initial.tolist()}; or choose truncated-normal"
         )
 
     def of_z(mean, std):
