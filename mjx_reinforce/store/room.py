@@ -55,12 +55,10 @@ def _of_seed(config: Config, policy: Policy, entries: int, horizon: int) -> int:
     """
     leaves = jax.tree.leaves(jax.eval_shape(policy.init, jax.random.key(0)))
     weights = _FLOAT * sum(math.prod(x.shape) for x in leaves)
-    value = 0
-    if Reader.VALUE_BASELINE.holds(config):
-        sizes = entries + 1, *config.value_hidden_sizes, 1  # it sees the time too
-        value = _FLOAT * sum((x + 1) * y for x, y in itertools.pairwise(sizes))
-    states, passing = weights + value, 0
+    states = weights
+    passing = 0
     if config.algorithm == "reinforce":
+        value = _value_bytes(config, entries)
         natural = config.update == "natural-gradient"
         adam = config.optimizer == "adam" and not natural
         states = (_ADAM if adam else _SGD) * weights + _ADAM * value
@@ -69,3 +67,11 @@ def _of_seed(config: Config, policy: Policy, entries: int, horizon: int) -> int:
         passing = vectors * weights + value + _FLOAT * samples * sum(config.hidden_sizes)
     host = _HOST_STATES * states + weights if jax.default_backend() == "cpu" else 0
     return _DEVICE_STATES * states + passing + host
+
+
+def _value_bytes(config: Config, entries: int) -> int:
+    """Returns the bytes of a value network, 0 without one; it sees the time too."""
+    if not Reader.VALUE_BASELINE.holds(config):
+        return 0
+    sizes = entries + 1, *config.value_hidden_sizes, 1
+    return _FLOAT * sum((x + 1) * y for x, y in itertools.pairwise(sizes))
