@@ -183,7 +183,7 @@ def test_a_ready_policy_may_be_trained():
     built = build(Survive(), config)[0].policy
     policy = built._replace(apply=lambda *arguments: built.apply(*arguments))
     assert built != policy
-    assert build(Survive(), config, policy)[0].policy is policy
+    assert build(Survive(), config, policy)[0].policy.apply is policy.apply
 
 
 def test_a_csv_file_grows_by_whole_rows(tmp_path):
