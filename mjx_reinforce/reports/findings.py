@@ -110,8 +110,6 @@ class Findings(NamedTuple):
 def compute_findings(experiment: Experiment) -> Findings:
     """Computes all figures of a report."""
     parts = experiment.configurations
-    if len(parts) == 1 and not parts[0].settings:  # a run, whose directory has a long name
-        parts = [parts[0]._replace(label=experiment.env)]
     ends = [int(part.env_steps[-1].min()) for part in parts]
     # A seed stops after the update that reaches its budget, so that ends differ a little.
     grid = _curve_steps(parts, min(end for end in ends if end >= _SAME_BUDGET * max(ends)))

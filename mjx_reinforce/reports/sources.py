@@ -163,13 +163,15 @@ def _told_apart(sources: Sequence[Source]) -> list[Configuration]:
     parts = []
     for (source, part), settings in zip(pairs, full, strict=True):
         own = {name: settings.get(name) for name in differ}
-        label = settings_in_words(own) or _path_in_words(source.directory.name)
+        # A run by itself is its task; several of one task are told by their directories.
+        place = _path_in_words(source.directory.name)
+        label = settings_in_words(own) or (source.env if len(pairs) == 1 else place)
         parts.append(part._replace(settings=own, label=label))
     times = Counter(part.label for part in parts)
     places = [f" in {_path_in_words(source.directory)}" for source, _ in pairs]
     return [
-        part._replace(label=part.label + place * (times[part.label] > 1))
-        for part, place in zip(parts, places, strict=True)
+        part._replace(label=part.label + where * (times[part.label] > 1))
+        for part, where in zip(parts, places, strict=True)
     ]
 
 

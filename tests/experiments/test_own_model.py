@@ -58,10 +58,10 @@ REFUSED = {
     ),
     '<actuator><general joint="j" gaintype="user"/></actuator>': "GAIN_USER.*<motor>",
     '<option><flag multiccd="disable"/></option>': 'ignore <flag multiccd="disable"/>; remove it',
-    '<worldbody><geom type="box" size="1 1 1" margin=".1"/></worldbody>': (
-        "sphere with a margin or gap, which MJX ignores .*; remove margin"
+    '<worldbody><geom type="box" size="1 1 1" margin=".1"/><body name="c"><freejoint/>'
+    '<geom type="box" size="1 1 1"/></body></worldbody>': (
+        "box on box with a margin or gap, which MJX ignores .*; remove margin"
     ),
-    '<option><flag override="enable"/></option>': "ENBL_OVERRIDE.*solref",
     '<tendon><fixed range="0 1" margin=".6"><joint joint="j" coef="1"/></fixed></tendon>': (
         "two limits that a tendon meets.*margin of at most half"
     ),
