@@ -30,6 +30,8 @@ from mjx_reinforce.engine.scalar.jaxprs import num_entries
 #: The bytes of the widest lane vector, 16 numbers of 8 bytes: a vector begins at a multiple of its
 #: size, as LLVM takes for granted.
 ALIGNMENT = 128
+#: Loops of a large model hold more between them than a thread's stack has room for.
+_MOST_ON_STACK = 2**20
 
 
 #: The buffers of a call: so many arguments of its own, those of the actor and the state, the
@@ -187,7 +189,9 @@ def kernel_text(step: scalarized.Scalarized, num_actor: int, lanes: int) -> str:
       lanes: how many lanes a vector has.
     """
     places = layout(step.in_avals, num_actor, lanes)
-    return queue_text(places, lanes) + _Work(Text(lanes), places, num_actor).write(step)
+    return queue_text(places, lanes) + _Work(Text(lanes, _MOST_ON_STACK), places, num_actor).write(
+        step
+    )
 
 
 class _Work(handler.JobText):
@@ -230,7 +234,7 @@ class _Work(handler.JobText):
             text.line(f"call void @settle({lane_of}, i64 {iterations.name})")
         text.line("call void @unflush(i64 %control)")
         text.line(f"call void @free(ptr {self.room})")
-        text.line("ret void")
+        text.leave()
         return text.function("void @work(ptr %job)")
 
     def _play(self, step: scalarized.Scalarized, alive: str) -> str:
@@ -313,7 +317,7 @@ def mapping_text(written: scalarized.Scalarized, lanes: int) -> str:
       written: the function.
       lanes: how many lanes a vector has.
     """
-    return _Map(Text(lanes), written).write()
+    return _Map(Text(lanes, _MOST_ON_STACK), written).write()
 
 
 class _Map(handler.JobText):
@@ -358,7 +362,7 @@ class _Map(handler.JobText):
         text.line(f"br label %{head}")
         text.start(end)
         text.line("call void @unflush(i64 %control)")
-        text.line("ret void")
+        text.leave()
         return text.function("void @work(ptr %job)")
 
     def _items(self, first: str, total: str) -> tuple[str, str]:

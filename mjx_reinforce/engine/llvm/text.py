@@ -1,6 +1,7 @@
 """LLVM IR as text: what every part of the LLVM backend writes into."""
 
 import functools
+import math
 import struct
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
@@ -73,9 +74,17 @@ class Text:
     block: the basic block that is being written.
     """
 
-    def __init__(self, lanes: int):
-        """Starts an empty body."""
+    def __init__(self, lanes: int, most_on_stack: float = math.inf):
+        """Starts an empty body.
+
+        Args:
+          lanes: how many values a lane vector holds.
+          most_on_stack: so many bytes the function takes of the stack at most. The rest of what it
+            reserves is allocated, until ``leave``.
+        """
         self.lanes = lanes
+        self._stack_left = most_on_stack
+        self._allocated: list[str] = []
         self.declared: set[str] = set()
         self.block = "start"
         self._reserved: list[str] = []
@@ -186,8 +195,31 @@ class Text:
     def reserve(self, dtype: DTypeLike, count: int) -> str:
         """Returns a pointer to room for lane vectors, which lasts until the function returns."""
         name, align = self.name(), max(_LEAST_ALIGN, np.dtype(dtype).itemsize * self.lanes)
+        size = count * np.dtype(dtype).itemsize * self.lanes
+        if size > self._stack_left:
+            self._allocate(name, size, align)
+            return name
+        self._stack_left -= size
         self._reserved.append(f"  {name} = alloca [{count} x {self.type(dtype)}], align {align}")
         return name
+
+    def _allocate(self, name: str, size: int, align: int) -> None:
+        """Writes at the function's start what gives a name to so many bytes of the heap."""
+        room, number, beyond, aligned = (self.name() for _ in range(4))
+        self._reserved += [
+            f"  {room} = call ptr @malloc(i64 {size + align})",
+            f"  {number} = ptrtoint ptr {room} to i64",
+            f"  {beyond} = add i64 {number}, {align - 1}",
+            f"  {aligned} = and i64 {beyond}, {-align}",
+            f"  {name} = inttoptr i64 {aligned} to ptr",
+        ]
+        self._allocated.append(room)
+
+    def leave(self) -> None:
+        """Ends the function, and frees what it allocated."""
+        for room in self._allocated:
+            self.line(f"call void @free(ptr {room})")
+        self.line("ret void")
 
     def table(self, dtype: DTypeLike, literals: list[str]) -> str:
         """Returns a pointer to constant scalars."""

@@ -63,6 +63,18 @@ def test_a_loop_reads_what_one_before_it_has_kept():
     np.testing.assert_allclose(got, jax.vmap(sums)(x), rtol=1e-5, atol=1e-6)
 
 
+def test_loops_may_keep_more_than_a_stack_has_room_for():
+    """Some 25 MB for 16 lanes: without the heap, the process ends."""
+
+    def there_and_back(x):
+        kept = jax.lax.scan(lambda y, _: (0.999 * y, y), x, None, 400_000)[1]
+        return jax.lax.scan(lambda y, row: (0.5 * y + row, None), x, kept[::-1])[0]
+
+    x = jnp.arange(1.0, 4.0)
+    got = jax.jit(machine_map(there_and_back, x[0]))(x)
+    np.testing.assert_allclose(got, x / (1 - 0.5 * 0.999), rtol=1e-5)
+
+
 def test_integers_divide_as_everywhere():
     """By zero, and the least one by -1, for both of which a processor stops the program."""
     edges = jnp.int32([-(2**31), -7, -1, 0, 1, 5, 2**31 - 1])
