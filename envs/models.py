@@ -14,7 +14,7 @@ from mujoco import MjModel, MjSpec, mjx  # pyright: ignore[reportAttributeAccess
 
 from mjx_reinforce.engine.checks import BadEnvironmentError, explain
 from mjx_reinforce.engine.physics import contacts
-from mjx_reinforce.envs.refusals import check_supported, is_off
+from mjx_reinforce.envs.refusals import check_supported, is_off, may_touch
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco
@@ -155,9 +155,20 @@ def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
     check_supported(model, name)
     try:
         # Not on JAX's first device, which may be another process's.
-        converted = mjx.put_model(model, impl="jax", device=jax.local_devices()[0])
+        device = jax.local_devices()[0]
+        converted = mjx.put_model(_without_idle_pairs(model), impl="jax", device=device)
         # Notices what the model alone does not show; its arrays are not made.
         jax.eval_shape(lambda: make_data(model))
     except Exception as error:  # of another library: no refusal
         raise BadEnvironmentError(f"converting {name} to MJX fails: {explain(error)}") from error
     return converted
+
+
+def _without_idle_pairs(model: MjModel) -> MjModel:
+    """Returns a model whose geoms meet none if a flag disables contacts: MJX looks at all pairs."""
+    if may_touch(model):
+        return model
+    apart = copy.copy(model)
+    apart.geom_contype[:] = 0
+    apart.geom_conaffinity[:] = 0
+    return apart

@@ -124,7 +124,7 @@ def _reasons(model: MjModel) -> Iterator[tuple[str, str]]:
     for feature, remedy in _ignored(model):
         yield f"MJX would ignore {feature}", remedy
     yield from _missing(model)
-    if may_touch(model):
+    if may_touch(model) or model.npair:  # MJX looks at pairs even where none may touch
         yield from _of_contacts(model)
 
 

@@ -135,6 +135,18 @@ def test_what_is_not_there_pushes_nothing(case, engine):
     assert error_beside_c(NO_ROWS[case], engine, fields, forces=True) < 1e-9
 
 
+IDLE = """<mujoco><option><flag {}="disable"/></option><worldbody>
+  <geom type="box" size="1 1 .1"/><body pos="0 0 .15"><joint name="a" type="slide" axis="0 0 1"/>
+    <geom type="ellipsoid" size=".1 .2 .3" mass="1"/></body></worldbody>
+  <actuator><motor joint="a"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("flag", ["constraint", "contact"])
+def test_pairs_that_a_flag_disables_need_no_contact_of_mjx(flag):
+    """dm_control's fish: MJX has no ellipsoid on a box, and looks for one all the same."""
+    assert error_beside_c(IDLE.format(flag), "vmap") < 1e-9
+
+
 MANY = """<mujoco model="many"><option solver="PGS" noslip_iterations="3" cone="elliptic"/>
   <asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset><worldbody>
   <body name="u"><joint name="j"/><geom type="cylinder" size=".1 .1" condim="1"/>
