@@ -228,7 +228,8 @@ def _unlike(kinds: tuple[int, int], margin: float) -> Iterator[tuple[str, str]]:
     if _GEOM.mjGEOM_SDF in kinds or not has_collider(*kinds):
         yield f"{names}, which MJX has not", f"{apart}spheres, capsules, boxes and planes"
     elif kinds in UNLIKE_C:
-        yield f"{names}, {UNLIKE_C[kinds]}", f"{apart}spheres, capsules, boxes and planes"
+        difference = UNLIKE_C[tuple(map(mjx.GeomType, kinds))]
+        yield f"{names}, {difference}", f"{apart}spheres, capsules, boxes and planes"
     elif margin and kinds in UNLIKE_C_WITHIN_MARGIN:
         remedy = "remove margin and gap from those geoms"
         yield f"{names} with a margin or gap, which MJX ignores", remedy

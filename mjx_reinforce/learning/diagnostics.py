@@ -155,14 +155,14 @@ class _Tried(NamedTuple):
     kl: that of the policies before the change and after this share of it
     within: the greatest share that is known to be within the limit
     beyond: the least that is known to be beyond it
-    count: how many were tried
+    tries: how many were tried
     """
 
     share: jax.Array
     kl: jax.Array
     within: jax.Array
     beyond: jax.Array
-    count: jax.Array
+    tries: jax.Array
 
 
 def _share_within(
@@ -181,7 +181,7 @@ def _share_within(
         return enough | (tried.share == 1.0)
 
     def unfinished(tried: _Tried) -> jax.Array:
-        return ~fits(tried) & (tried.count < _MOST_TRIED)
+        return ~fits(tried) & (tried.tries < _MOST_TRIED)
 
     def body(tried: _Tried) -> _Tried:
         below = tried.kl <= _MOST * max_kl
@@ -189,9 +189,9 @@ def _share_within(
         beyond = jnp.where(below, tried.beyond, tried.share)
         # Where KL is no square of the share, every second one halves what is left.
         square = tried.share * jnp.sqrt(_AIM * max_kl / tried.kl)
-        usable = (square > within) & (square < beyond) & (tried.count % 2 == 1)
+        usable = (square > within) & (square < beyond) & (tried.tries % 2 == 1)
         share = jnp.where(usable, square, jnp.sqrt(within) * jnp.sqrt(beyond))
-        again = _Tried(share, kl_at(share), within, beyond, tried.count + 1)
+        again = _Tried(share, kl_at(share), within, beyond, tried.tries + 1)
         more = unfinished(tried)
         return jax.tree.map(lambda new, old: jnp.where(more, new, old), again, tried)
 

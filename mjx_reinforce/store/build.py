@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import optax
 
@@ -177,8 +177,8 @@ def _build_optimizer(config: Config, space: Box | Discrete) -> optax.GradientTra
     if config.final_std is None:
         return optimizer
     initial_std = config.initial_std
-    if initial_std is None and isinstance(space, Box):
-        initial_std = default_std(space)
+    if initial_std is None:  # a trained deviation has bounds of actions, or none
+        initial_std = default_std(cast(Box, space))
     ratio = config.final_std / initial_std
     return optax.chain(optimizer, schedules.shrink_std(ratio, length))
 

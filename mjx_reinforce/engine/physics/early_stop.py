@@ -42,27 +42,27 @@ def stops_early(model: Any) -> bool:
 class _Islands(NamedTuple):
     """Which degrees of freedom and rows are solved together.
 
-    count: how many islands there may be
-    dofs: [nv] the number of each one's island, ``count`` if it has none
+    size: how many islands there may be
+    dofs: [nv] the number of each one's island, ``size`` if it has none
     rows: [rows] the same
     """
 
-    count: int
+    size: int
     dofs: Any
     rows: Any
 
     def total(self, values: jax.Array, labels: Any) -> jax.Array:
         """Adds up what degrees of freedom or rows with these labels have, [islands]."""
-        if self.count == 1:
+        if self.size == 1:
             return jnp.sum(values)[None]
-        members = labels == jnp.arange(self.count)[:, None]
+        members = labels == jnp.arange(self.size)[:, None]
         return jnp.sum(jnp.where(members, values, 0), 1)
 
     def spread(self, values: jax.Array, labels: Any) -> jax.Array:
         """Gives each degree of freedom or row what its island has; without one, zero."""
-        if self.count == 1:
+        if self.size == 1:
             return values[0]
-        members = labels == jnp.arange(self.count)[:, None]
+        members = labels == jnp.arange(self.size)[:, None]
         return jnp.sum(jnp.where(members, values[:, None], 0), 0)  # machine code has no lookups
 
 
@@ -133,8 +133,8 @@ def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.A
     def improve(search: _Search) -> _Search:
         before = search.point
         direction, gradient = newton.newton_direction(problem, before)
-        if islands.count > 1:
-            direction = jnp.where(islands.dofs < islands.count, direction, 0)
+        if islands.size > 1:
+            direction = jnp.where(islands.dofs < islands.size, direction, 0)
         flat = scale * jnp.sqrt(islands.total(gradient**2, islands.dofs)) < tolerance
         decrement = -islands.total(gradient * direction, islands.dofs) / 2
         near = jnp.maximum(scale * decrement, 0) < tolerance
@@ -159,7 +159,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.A
         return _Search(after, -end.cost, search.steps + 1, going & (length != 0))
 
     first = newton.start(model, data, problem)
-    if islands.count > 1:  # what no row holds is not the solver's
+    if islands.size > 1:  # what no row holds is not the solver's
         first = _released(data, islands, first)
     zeros = jnp.zeros_like(scale)
     end = jax.lax.while_loop(
@@ -172,7 +172,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.A
 
 def _released(data: mjx.Data, islands: _Islands, point: newton.Point) -> newton.Point:
     """Returns a point with the unconstrained acceleration where there is no island."""
-    free = islands.dofs == islands.count
+    free = islands.dofs == islands.size
     qacc = jnp.where(free, data.qacc_smooth, point.qacc)
     return point._replace(qacc=qacc, imbalance=jnp.where(free, 0, point.imbalance))
 
