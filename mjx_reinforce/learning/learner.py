@@ -304,8 +304,9 @@ class _Reinforce:
         proposed = Actor(params=params, normalizer=normalizer)
         actor = diagnostics.within_kl(self.policy, before, proposed, visited, self.max_kl)
         after = state.replace(actor=actor, opt_state=opt_state, estimator_state=estimator_state)
-        # A norm that overflows would make a step of nothing.
-        sound = jnp.isfinite(measured.get("gradient_norm", 0.0))
+        # Without one sound episode, or with a norm that overflows, the step would say nothing.
+        sound = ~jnp.all(trajectory.nonfinite)
+        sound &= jnp.isfinite(measured.get("gradient_norm", 0.0))
         after, skipped = keep_finite(after, state, sound)
 
         change = diagnostics.policy_metrics(self.policy, before, after.actor, visited)
@@ -351,11 +352,11 @@ def train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics
       update), ``simulated_steps`` (also those after an episode's end; with the native engine they
       depend on which thread is first), ``nonfinite_episodes`` (those that broke; they count above
       with what they earned until then), and ``skipped_update`` (1 if the proposed state was not
-      finite, so that the old one was kept). Then the
-      diagnostics, NaN if an episode was not finite or the update was skipped:
-      ``entropy``, ``kl``, ``policy_std`` (see ``diagnostics.policy_metrics``),
-      ``gradient_norm``, ``gradient_snr`` (of ``full_batch`` and ``natural_gradient`` alone),
-      ``explained_variance`` (of an estimator with a baseline), and the estimator's own.
+      finite, or if all episodes broke, so that the old one was kept). Then the diagnostics, NaN if
+      an episode was not finite or the update was skipped: ``entropy``, ``kl``, ``policy_std`` (see
+      ``diagnostics.policy_metrics``), ``gradient_norm``, ``gradient_snr`` (of ``full_batch`` and
+      ``natural_gradient`` alone), ``explained_variance`` (of an estimator with a baseline), and the
+      estimator's own.
 
     Examples:
       >>> import jax

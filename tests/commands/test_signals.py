@@ -18,7 +18,7 @@ from mjx_reinforce import load_policy
 
 #: One of our tasks, whose programs are kept on disk after the first start.
 TASK = ["--env", "ContinuousCartPole-v0"]
-FOREVER = [*TASK, "--env-steps", "1000000000", "--output", "out"]
+FOREVER = [*TASK, "--env-steps", "1000000000", "--eval-every", "500", "--output", "out"]
 #: It takes seconds to compile.
 HEAVY = ["--env", "InvertedPendulum-v5", "--engine", "vmap", "--output", "out"]
 #: What it does before it ends takes longer than the screen is waited for.
