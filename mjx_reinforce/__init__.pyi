@@ -56,8 +56,8 @@ from . import registry as registry
 from . import reports as reports
 from . import runs as runs
 from . import settings as settings
+from . import setup as setup
 from . import statistics as statistics
-from . import store as store
 from . import training as training
 
 __version__: str

@@ -30,7 +30,7 @@ def _command(arguments: list[str]) -> tuple[str, list[str]]:
     if first in COMMANDS:
         return first, arguments[1:]
     from mjx_reinforce.console.streams import accept_everything, say, say_error
-    from mjx_reinforce.store.provenance import version
+    from mjx_reinforce.setup.provenance import version
 
     accept_everything()
     ours = version("mjx-reinforce") or "not installed"

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.engine.play.episode import begin, hold, step
+from mjx_reinforce.engine.episode import begin, hold, step
 from mjx_reinforce.envs.in_mujoco import InMujoco
 from mjx_reinforce.export.policy_files import Player
 from mjx_reinforce.learning.policy import act

@@ -35,9 +35,9 @@ ESTIMATORS = {
 class Algorithm(NamedTuple):
     """A way to learn.
 
-    make: "module:function" of an environment, the settings, and what ``store.build`` adds
+    make: "module:function" of an environment, the settings, and what ``setup.build`` adds
     search_episodes: episodes of an update, of one that tries out policies; 0: it follows a gradient
-    policy: what its policies have in place of the usual, see ``store.build.policy_settings``
+    policy: what its policies have in place of the usual, see ``setup.build.policy_settings``
     """
 
     make: str
@@ -49,7 +49,7 @@ class Algorithm(NamedTuple):
 _AS_PUBLISHED = {"initializer": "torch", "rescale": False}
 #: Ways to learn, by name: ours, and programs of published documents.
 ALGORITHMS = {
-    "reinforce": Algorithm("mjx_reinforce.store.build:build_reinforce"),
+    "reinforce": Algorithm("mjx_reinforce.setup.build:build_reinforce"),
     "ars": Algorithm("mjx_reinforce.published.ars:make", search_episodes=16),
     "gymnasium-tutorial": Algorithm(
         "mjx_reinforce.published.gymnasium_tutorial:reward_to_go", policy=_AS_PUBLISHED

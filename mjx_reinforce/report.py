@@ -21,7 +21,7 @@ from mjx_reinforce.reports.experiment import Experiment, say
 from mjx_reinforce.reports.findings import Findings, compute_findings, swept, worst_seeds
 from mjx_reinforce.settings.config import code_flags
 from mjx_reinforce.settings.flags import run_command
-from mjx_reinforce.store.provenance import version
+from mjx_reinforce.setup.provenance import version
 from mjx_reinforce.training.resume import BEGUN
 
 #: How the names of pages end.

@@ -20,28 +20,55 @@ import mjx_reinforce
 TESTS = ROOT / "tests"
 PACKAGE = ROOT / "mjx_reinforce"
 #: Folders and root modules from the ground up; a file imports from its own folder and those before.
-ORDER = (
-    *(
-        "engine",
-        "registry",
-        "envs",
-        "files",
-        "learning",
-        "published",
-        "console",
-        "settings",
-        "gym",
-        "export",
-        "statistics",
-    ),
-    *("reports", "training", "store", "playing", "report", "runs", "sweep", "train"),
-    *("watch", "new", "__main__"),
-)
+ORDER = [
+    "engine",
+    "registry",
+    "envs",
+    "files",
+    "learning",
+    "published",
+    "console",
+    "settings",
+    "gym",
+    "export",
+    "statistics",
+    "reports",
+    "training",
+    "setup",
+    "playing",
+    "report",
+    "runs",
+    "sweep",
+    "train",
+    "watch",
+    "new",
+    "__main__",
+]
+#: The floors of the engine, the same way.
+FLOORS = [
+    "lazy",
+    "base",
+    "memory",
+    "checks",
+    "contract",
+    "devices",
+    "objects",
+    "scalar",
+    "episode",
+    "physics",
+    "llvm",
+    "cpu",
+    "team",
+    "gpu",
+    "play",
+    "cache",
+    "vector",
+]
 #: Commands of folders, found where ``python -m`` looks for them. They use what comes later.
 COMMANDS = {"envs.__main__"}
 #: Who may know that our environments exist; all others take any environment as an argument.
 MAY_IMPORT_ENVS = {
-    *("envs", "settings", "training", "store", "runs", "playing"),
+    *("envs", "settings", "training", "setup", "runs", "playing"),
     *("gym", "train", "watch", "new", "__main__"),
 }
 
@@ -96,6 +123,24 @@ def test_imports_point_one_way():
         for name, other in arrows
         if ORDER.index(folder(other)) > ORDER.index(folder(name))
         or (folder(other) == "envs" and folder(name) not in MAY_IMPORT_ENVS)
+    ] == []
+
+
+def test_imports_in_the_engine_point_one_way():
+    """From a floor to those before it."""
+    inside = {name: path for name, path in FILES.items() if name.startswith("engine.")}
+    arrows = [
+        (name.split(".")[1], other.split(".")[1])
+        for name, path in inside.items()
+        for other in imported(path)
+        if other != "engine"
+    ]
+    assert len(arrows) > len(inside)
+    assert {name.split(".")[1] for name in inside} == {*FLOORS}
+    assert [
+        f"{floor} imports {other}"
+        for floor, other in arrows
+        if FLOORS.index(other) > FLOORS.index(floor)
     ] == []
 
 
@@ -186,7 +231,7 @@ def test_pages_films_and_logs_wait():
     loaded = run(
         "import sys, mjx_reinforce.train, mjx_reinforce.watch, mjx_reinforce.runs.command_line\n"
         "import mjx_reinforce.runs.results, mjx_reinforce.runs.saving\n"
-        "import mjx_reinforce.store.ready\n"
+        "import mjx_reinforce.setup.ready\n"
         f"print([m for m in {late} if m in sys.modules])"
     )
     assert loaded.strip() == "[]"

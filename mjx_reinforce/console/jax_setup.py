@@ -5,7 +5,7 @@ import os
 import sys
 from pathlib import Path
 
-from mjx_reinforce.engine.play.objects import distrust, make_folder
+from mjx_reinforce.engine.objects import distrust, make_folder
 
 #: Settings of JAX's that the commands cannot work with, and why.
 _REFUSED = {

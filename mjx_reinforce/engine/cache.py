@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import jax
 from jax import export
 
+from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.cpu import seam
 from mjx_reinforce.engine.gpu import seam as gpu_seam
-from mjx_reinforce.engine.play import objects
 from mjx_reinforce.engine.play.available import made_for, platform
 
 

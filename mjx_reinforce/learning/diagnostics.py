@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from mjx_reinforce.engine.base import Trajectory
-from mjx_reinforce.engine.play.episode import while_any
+from mjx_reinforce.engine.episode import while_any
 from mjx_reinforce.learning import normalize
 from mjx_reinforce.learning.distributions import Distribution
 from mjx_reinforce.learning.policy import Actor, Policy, act

@@ -18,9 +18,9 @@ from mjx_reinforce.engine.base import Environment, Trajectory, action_space, obs
 from mjx_reinforce.engine.checks import check_count, check_key, check_kind, check_number
 from mjx_reinforce.engine.contract import check_environment
 from mjx_reinforce.engine.devices import check_room
+from mjx_reinforce.engine.episode import check_each, episode_keys
 from mjx_reinforce.engine.play import choice
 from mjx_reinforce.engine.play.choice import Engine, Rollout
-from mjx_reinforce.engine.play.episode import check_each, episode_keys
 from mjx_reinforce.engine.play.rollouts import episode_lengths, episode_returns
 from mjx_reinforce.learning import contract, counts, diagnostics, normalize
 from mjx_reinforce.learning.diagnostics import Metrics

@@ -15,7 +15,7 @@ from jax import lax
 from optax import Params
 
 from mjx_reinforce.engine.checks import check_name, check_number
-from mjx_reinforce.engine.play.episode import largest_divisor, while_any
+from mjx_reinforce.engine.episode import largest_divisor, while_any
 
 #: Samples whose activations are held at once; 2**18 of them take 64 MB a 64-unit layer.
 MAX_SAMPLES = 2**18

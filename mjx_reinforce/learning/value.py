@@ -14,7 +14,7 @@ from flax import linen as nn
 from jax import lax
 
 from mjx_reinforce.engine.checks import check_count
-from mjx_reinforce.engine.play.episode import while_any
+from mjx_reinforce.engine.episode import while_any
 from mjx_reinforce.learning.estimators import Estimator, explained_variance, reward_to_go
 from mjx_reinforce.learning.policy import MLP
 from mjx_reinforce.learning.updates import (

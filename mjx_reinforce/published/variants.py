@@ -12,7 +12,7 @@ from jax.typing import ArrayLike
 
 from mjx_reinforce.engine.base import Box, Discrete
 from mjx_reinforce.engine.checks import check_count
-from mjx_reinforce.engine.play.episode import while_any
+from mjx_reinforce.engine.episode import while_any
 from mjx_reinforce.learning.distributions import Distribution, gaussian_outputs
 from mjx_reinforce.learning.estimators import (
     Estimator,

@@ -11,7 +11,7 @@ from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.runs.display import Display, SweepScreen
 from mjx_reinforce.runs.plan import Part, Prepared
 from mjx_reinforce.runs.saving import Files
-from mjx_reinforce.store.compile_times import keep_seconds
+from mjx_reinforce.setup.compile_times import keep_seconds
 from mjx_reinforce.training.driver import Driver, Observer, Runs, Training, begin_run
 from mjx_reinforce.training.record import Record
 from mjx_reinforce.training.slots import Compiled, Slots, Stopwatch, compile_slots, started

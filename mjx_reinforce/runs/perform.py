@@ -205,7 +205,7 @@ def perform(
             from mjx_reinforce.runs.conduct import conduct
             from mjx_reinforce.runs.plan import describe, prepare
             from mjx_reinforce.runs.saving import RunFiles, SweepFiles
-            from mjx_reinforce.store.compile_times import describe_compiling
+            from mjx_reinforce.setup.compile_times import describe_compiling
         except MemoryError as error:
             raise ImportError(f"no memory is left {error}".strip()) from error
 

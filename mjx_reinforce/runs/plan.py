@@ -21,8 +21,8 @@ from mjx_reinforce.settings.config import Config, is_read, marked
 from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.defaults import num_cores
 from mjx_reinforce.settings.groups import Reader
-from mjx_reinforce.store.provenance import provenance
-from mjx_reinforce.store.ready import Ready, get_ready
+from mjx_reinforce.setup.provenance import provenance
+from mjx_reinforce.setup.ready import Ready, get_ready
 from mjx_reinforce.training import resume
 from mjx_reinforce.training.division import Division
 from mjx_reinforce.training.driver import Runs

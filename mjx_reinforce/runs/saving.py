@@ -35,7 +35,7 @@ from mjx_reinforce.runs.design import as_record
 from mjx_reinforce.runs.plan import Part, Prepared
 from mjx_reinforce.runs.sinks import Sink, open_sinks
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.store.provenance import provenance
+from mjx_reinforce.setup.provenance import provenance
 from mjx_reinforce.training import resume
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer, Seen, Training
 from mjx_reinforce.training.record import HEADER, lines

@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 
 from mjx_reinforce.engine.base import Environment, Trajectory, plain
-from mjx_reinforce.engine.play.episode import episode_keys
+from mjx_reinforce.engine.episode import episode_keys
 from mjx_reinforce.engine.play.rollouts import episode_lengths, episode_returns
 from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.learner import Learner, TrainState

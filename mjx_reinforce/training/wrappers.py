@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory
 from mjx_reinforce.engine.checks import check_kind
 from mjx_reinforce.engine.devices import NONE, RUNS, SECOND, Devices
-from mjx_reinforce.engine.play.episode import CHUNK_STEPS
+from mjx_reinforce.engine.episode import CHUNK_STEPS
 from mjx_reinforce.engine.scalar import any_lane
 from mjx_reinforce.learning.contract import traced
 from mjx_reinforce.learning.learner import Learner, Metrics, TrainState
@@ -45,7 +45,7 @@ _METRICS = (
 class EvaluationEpisodes(NamedTuple):
     """E episodes that are played in one launch with an update, and from which nothing learns.
 
-    keys: [E] their own keys, as ``engine.play.episode.episode_keys`` makes them
+    keys: [E] their own keys, as ``engine.episode.episode_keys`` makes them
     num_modes: how many of them, the first, take the policy's mode; the others its samples
     active: [] whether they are played
     """

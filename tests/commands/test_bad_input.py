@@ -42,7 +42,7 @@ from mjx_reinforce.settings.config import (
 from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.defaults import PRESETS
 from mjx_reinforce.settings.groups import Reader
-from mjx_reinforce.store.build import build
+from mjx_reinforce.setup.build import build
 
 # Settings that make no sense.
 

@@ -18,7 +18,7 @@ from mjx_reinforce import load, load_policy
 from mjx_reinforce.files import append, csv_text
 from mjx_reinforce.learning import normalize
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.store.build import build
+from mjx_reinforce.setup.build import build
 
 ARGUMENTS = ["--env", "Survive-v0", "--num-seeds", "3", "--env-steps", "1500"]
 

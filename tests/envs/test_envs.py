@@ -15,14 +15,14 @@ from command_lines import run_command
 from gymnasium.envs.registration import load_env_creator
 
 from mjx_reinforce import Environment, envs, watch
+from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.base import Discrete, action_space, null_action, observation_size
 from mjx_reinforce.engine.checks import BadEnvironmentError
-from mjx_reinforce.engine.play import objects
 from mjx_reinforce.envs.outcomes import check_outcome, check_start
 from mjx_reinforce.envs.settings import EpisodeSettings, read_settings
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import HORIZONS
-from mjx_reinforce.store import ready
+from mjx_reinforce.setup import ready
 
 IDS = envs.names()
 #: Arguments of Gymnasium's tasks that are about pictures.

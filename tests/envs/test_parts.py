@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mjx_reinforce import make_vec, mlp_policy, normal, playing, reinforce, rollout
-from mjx_reinforce.engine.play.episode import episode_keys
+from mjx_reinforce.engine.episode import episode_keys
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import MujocoEnv
 from mjx_reinforce.envs.in_mujoco import InMujoco

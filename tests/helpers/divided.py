@@ -14,7 +14,7 @@ import numpy as np
 from mjx_reinforce import envs
 from mjx_reinforce.engine.base import plain
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.store import build, ready
+from mjx_reinforce.setup import build, ready
 from mjx_reinforce.training.division import ALONE, Division
 from mjx_reinforce.training.slots import compile_run
 

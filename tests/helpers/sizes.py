@@ -1,10 +1,12 @@
 """How large the repository is; ``python tests/helpers/sizes.py [FOLDER]`` prints it.
 
-Code is what is neither a docstring nor a comment nor blank; the words are those of ``docs/``.
+Code is what is neither a docstring nor a comment nor blank, in Python and in C++; words are those
+of ``docs/``.
 """
 
 import ast
 import io
+import re
 import sys
 import tokenize
 import tomllib
@@ -14,15 +16,16 @@ _SILENT = (
     *(tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT),
     *(tokenize.ENCODING, tokenize.ENDMARKER),
 )
-#: The folder of the engine that counts apart from the package.
-TEAM = "team"
 #: A function that takes more lines, its docstring apart, is long.
 _LONG = 60
 
 
 def code(path):
-    """Returns how many lines of code a Python file has."""
+    """Returns how many lines of code a file of Python or C++ has."""
     text = path.read_text("utf-8")
+    if path.suffix != ".py":
+        lines = re.sub(r"/\*.*?\*/|//[^\n]*", "", text, flags=re.DOTALL).splitlines()
+        return sum(bool(line.strip()) for line in lines)
     lines = {
         number
         for token in tokenize.generate_tokens(io.StringIO(text).readline)
@@ -48,11 +51,10 @@ def sizes(root):
         "package": [
             path
             for folder in ("mjx_reinforce", "envs")
-            for path in (root / folder).rglob("*.py")
-            if "mjx_reinforce/envs/" not in path.as_posix()  # a link to the folder at the top
-            and TEAM not in path.parts
+            for path in (root / folder).rglob("*")
+            if path.suffix in (".py", ".h")
+            and "mjx_reinforce/envs/" not in path.as_posix()  # a link to the folder at the top
         ],
-        "team": [*(root / "mjx_reinforce" / "engine" / TEAM).rglob("*.py")],
         "experiments": [*(root / "experiments").rglob("*.py")],
         "tests": [*(root / "tests").rglob("*.py")],
     }
@@ -72,7 +74,7 @@ def sizes(root):
             len(path.read_text("utf-8").split()) for path in (root / "docs").rglob("*.md")
         ),
         "long_functions": sum(
-            len([*_long_functions(path)]) for path in parts["package"] + parts["team"]
+            len([*_long_functions(path)]) for path in parts["package"] if path.suffix == ".py"
         ),
     }
 

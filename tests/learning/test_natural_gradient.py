@@ -19,7 +19,7 @@ from mjx_reinforce.learning.bounded import tanh_normal, truncated_normal
 from mjx_reinforce.learning.distributions import categorical, normal
 from mjx_reinforce.learning.updates import Clock, Problem, full_batch
 from mjx_reinforce.settings.config import Config, check
-from mjx_reinforce.store.build import _build_optimizer
+from mjx_reinforce.setup.build import _build_optimizer
 
 MASK = np.arange(6)[:, None] < np.array([6, 1, 0, 4])
 BOX = Box(np.array([-1.0, 0.0]), np.array([1.0, 4.0]))

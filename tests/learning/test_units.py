@@ -16,7 +16,7 @@ from mjx_reinforce.learning.policy import within_bounds
 from mjx_reinforce.learning.updates import Clock
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import OF_BUDGETS, OF_TASKS, PRESETS
-from mjx_reinforce.store import build
+from mjx_reinforce.setup import build
 
 MIXED = Box(np.array([-3.0, 0.0, -np.inf]), np.array([3.0, 255.0, 1.0]))
 

@@ -15,7 +15,7 @@ from mjx_reinforce.learning import counts, schedules, updates
 from mjx_reinforce.learning.updates import Problem
 from mjx_reinforce.published import variants
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.store.build import _build_optimizer
+from mjx_reinforce.setup.build import _build_optimizer
 
 
 def run(update, problem, key=None):

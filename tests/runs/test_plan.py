@@ -20,7 +20,7 @@ from mjx_reinforce.runs import command_line, plan
 from mjx_reinforce.runs.design import Design, check_design
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import HORIZONS, MINUTES, PRESETS, of_task
-from mjx_reinforce.store import ready, room
+from mjx_reinforce.setup import ready, room
 from mjx_reinforce.training import slots
 
 

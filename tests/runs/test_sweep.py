@@ -30,8 +30,8 @@ from mjx_reinforce.runs.plan import make_groups
 from mjx_reinforce.runs.results import read_results
 from mjx_reinforce.runs.saving import SweepFiles, join_parts
 from mjx_reinforce.settings.config import Config, check
-from mjx_reinforce.store import ready
-from mjx_reinforce.store.build import build
+from mjx_reinforce.setup import ready
+from mjx_reinforce.setup.build import build
 from mjx_reinforce.training import driver, resume, slots
 from mjx_reinforce.training.division import ALONE
 from mjx_reinforce.training.programs import programs_of

@@ -19,7 +19,7 @@ from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.runs import command_line
 from mjx_reinforce.settings.config import check, check_read_by_policy
 from mjx_reinforce.settings.defaults import PRESETS, of_task
-from mjx_reinforce.store.build import build, policy_settings
+from mjx_reinforce.setup.build import build, policy_settings
 
 TINY = ["--num-seeds", "2", "--max-updates", "2", "--horizon", "8"]
 TINY += ["--eval-every", "1", "--eval-episodes", "1"]

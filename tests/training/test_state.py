@@ -12,7 +12,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.engine.base import plain
 from mjx_reinforce.learning import counts
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.store import ready
+from mjx_reinforce.setup import ready
 from mjx_reinforce.training.slots import compile_run
 from mjx_reinforce.training.state import seed_keys
 

@@ -22,7 +22,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import PRESETS
-from mjx_reinforce.store.build import build, policy_settings
+from mjx_reinforce.setup.build import build, policy_settings
 from mjx_reinforce.training.programs import programs_of
 from mjx_reinforce.training.slots import compile_run
 

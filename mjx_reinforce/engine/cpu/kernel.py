@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from mjx_reinforce.engine.cpu import handler
+from mjx_reinforce.engine.episode import NOT_PLAYED
 from mjx_reinforce.engine.llvm.emit import LLVM, Input
 from mjx_reinforce.engine.llvm.text import Text
-from mjx_reinforce.engine.play.episode import NOT_PLAYED
 from mjx_reinforce.engine.scalar import scalarized
 from mjx_reinforce.engine.scalar.jaxprs import num_entries
 

@@ -15,9 +15,9 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.checks import check_name
 from mjx_reinforce.engine.cpu import emit
-from mjx_reinforce.engine.play import objects
 
 #: Asks for code that older CPUs run too; one of ``LEVELS``.
 VARIABLE = "MJX_REINFORCE_CPU"

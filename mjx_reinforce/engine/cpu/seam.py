@@ -12,9 +12,9 @@ from pathlib import Path
 
 import jax
 
+from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.cpu import emit, handler, machine
 from mjx_reinforce.engine.cpu.machine import Code
-from mjx_reinforce.engine.play import objects
 
 _WAITING = Path(__file__).with_name("waiting.ll")
 #: The keys of the code that XLA knows.

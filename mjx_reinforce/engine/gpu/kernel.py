@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjx_reinforce.engine.episode import NOT_PLAYED
 from mjx_reinforce.engine.llvm.emit import LLVM, Input, Value
 from mjx_reinforce.engine.llvm.text import Text
-from mjx_reinforce.engine.play.episode import NOT_PLAYED
 from mjx_reinforce.engine.scalar import scalarized
 from mjx_reinforce.engine.scalar.jaxprs import num_entries
 from mjx_reinforce.engine.scalar.nodes import Node

@@ -19,11 +19,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from mjx_reinforce.engine import scalar
+from mjx_reinforce.engine import objects, scalar
 from mjx_reinforce.engine.cpu import handler, machine
+from mjx_reinforce.engine.gpu import nvrtc
 from mjx_reinforce.engine.gpu.kernel import ENTRY
-from mjx_reinforce.engine.play import objects
-from mjx_reinforce.engine.team import nvrtc
 
 #: LLVM's name of NVIDIA's GPUs.
 TRIPLE = "nvptx64-nvidia-cuda"

@@ -15,10 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.engine.gpu import ptx
-from mjx_reinforce.engine.play import objects
-from mjx_reinforce.engine.team import kernel as team
-from mjx_reinforce.engine.team import nvrtc
+from mjx_reinforce.engine import objects
+from mjx_reinforce.engine.gpu import nvrtc, ptx
+from mjx_reinforce.engine.gpu import team_kernel as team
 
 #: LLVM 22, which llvmlite 0.48 has, is the first that bounds a kernel's threads and blocks.
 _OLDEST = (22,)

@@ -21,7 +21,7 @@ from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory
 from mjx_reinforce.engine.checks import check_count, check_key, check_name, check_parts
 from mjx_reinforce.engine.contract import check_policy
 from mjx_reinforce.engine.play import available, native, program, rollouts
-from mjx_reinforce.engine.team import program as team
+from mjx_reinforce.engine.play import teams as team
 
 #: This JAX multiplies wrongly on CPUs, in some functions that are mapped over some 16,000 rows and
 #: more, and says nothing (JAX's issue 39103). Where we looked, with 33,000 to 65,000 rows, no

@@ -13,12 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_reinforce.engine import episode
 from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory
 from mjx_reinforce.engine.contract import check_shape
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.cpu import seam as cpu
 from mjx_reinforce.engine.gpu import seam as gpu
-from mjx_reinforce.engine.play import available, episode
+from mjx_reinforce.engine.play import available
 from mjx_reinforce.engine.play.counter import key_of
 from mjx_reinforce.engine.play.program import (
     NativeProgram,

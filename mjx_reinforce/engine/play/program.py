@@ -10,19 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from mjx_reinforce.engine import base, scalar
+from mjx_reinforce.engine import base, episode, objects, scalar
 from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, observation_size
 from mjx_reinforce.engine.checks import explain
 from mjx_reinforce.engine.cpu import handler, kernel, machine
 from mjx_reinforce.engine.cpu import seam as cpu_seam
 from mjx_reinforce.engine.gpu import kernel as gpu_kernel
-from mjx_reinforce.engine.gpu import ptx
+from mjx_reinforce.engine.gpu import ptx, team_kernel
 from mjx_reinforce.engine.gpu import seam as gpu_seam
-from mjx_reinforce.engine.play import available, episode, objects
+from mjx_reinforce.engine.play import available
+from mjx_reinforce.engine.play import teams as team
 from mjx_reinforce.engine.play.counter import at_counter, split
 from mjx_reinforce.engine.scalar import jaxprs, scalarized
-from mjx_reinforce.engine.team import kernel as team_kernel
-from mjx_reinforce.engine.team import program as team
 
 #: A branch of more scalar operations is skipped where no lane needs it.
 BRANCH_COST = 40

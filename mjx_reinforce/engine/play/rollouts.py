@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from mjx_reinforce.engine import episode
 from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory
-from mjx_reinforce.engine.play import episode
 
 
 class _Progress(NamedTuple):

@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 
+from mjx_reinforce.engine import episode
 from mjx_reinforce.engine.base import (
     Arrays,
     Box,
@@ -28,7 +29,6 @@ from mjx_reinforce.engine.base import (
 from mjx_reinforce.engine.checks import check_count, check_key, check_name, check_type
 from mjx_reinforce.engine.contract import check_environment, check_shape
 from mjx_reinforce.engine.memory import gigabytes, host_memory
-from mjx_reinforce.engine.play import episode
 from mjx_reinforce.engine.play.available import GENERATOR
 from mjx_reinforce.engine.play.choice import MapEngine, map_function
 from mjx_reinforce.engine.play.counter import key_of

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 from jax import export
 
+from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.cpu import handler, machine
 from mjx_reinforce.engine.gpu import ptx, seam
 from mjx_reinforce.engine.gpu.ptx import Assembler
-from mjx_reinforce.engine.play import available, objects
+from mjx_reinforce.engine.play import available
 
 if reason := available.unavailable():
     pytest.skip(reason, allow_module_level=True)

@@ -11,11 +11,12 @@ import pytest
 from players import actor_and_act
 from toys import Drifting
 
+from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.gpu import ptx
-from mjx_reinforce.engine.play import available, objects, program
+from mjx_reinforce.engine.objects import distrust
+from mjx_reinforce.engine.play import available, program
 from mjx_reinforce.engine.play.choice import machine_code
-from mjx_reinforce.engine.play.objects import distrust
 
 if reason := available.unavailable():
     pytest.skip(reason, allow_module_level=True)

@@ -11,11 +11,11 @@ from players import actor_and_act, assert_same_episodes, both, only_active, play
 from toys import Drifting
 
 from mjx_reinforce import Box
-from mjx_reinforce.engine import scalar
+from mjx_reinforce.engine import objects, scalar
 from mjx_reinforce.engine.base import Discrete
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.gpu import ptx
-from mjx_reinforce.engine.play import available, choice, native, objects, program, rollouts
+from mjx_reinforce.engine.play import available, choice, native, program, rollouts
 from mjx_reinforce.engine.scalar import scalarized, size
 from mjx_reinforce.registry import DISTRIBUTIONS, load_definition
 

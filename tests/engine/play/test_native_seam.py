@@ -16,8 +16,9 @@ import pytest
 from jax import lax
 from places import PYTHONPATH
 
+from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.cpu import handler, machine, seam
-from mjx_reinforce.engine.play import available, objects
+from mjx_reinforce.engine.play import available
 
 pytestmark = pytest.mark.cpu
 ACTIVE = [1, 0, 1, 1, 0, 7]
@@ -150,7 +151,7 @@ def test_results_are_zeroed_by_all_threads():
 def test_a_second_process_compiles_nothing(tmp_path):
     """Neither LLVM nor XLA."""
     program = """
-from mjx_reinforce.engine.play import objects
+from mjx_reinforce.engine import objects
 events = []
 jax.monitoring.register_event_listener(lambda e, **_: events.append(e))
 code = items.load(objects.folder())
@@ -265,7 +266,7 @@ def test_it_says_why_it_is_unavailable(monkeypatch):
 
 
 def test_the_engine_is_imported_without_llvmlite():
-    names = ("play.objects", "cpu.machine", "cpu.handler", "cpu.seam", "gpu.ptx", "gpu.seam")
+    names = ("objects", "cpu.machine", "cpu.handler", "cpu.seam", "gpu.ptx", "gpu.seam")
     program = "".join(f"import mjx_reinforce.engine.{name}\n" for name in names)
     assert run(f"{program}print('llvmlite' in sys.modules)") == ["False"]
 

@@ -9,7 +9,8 @@ import pytest
 from players import only_active
 from toys import Chain, Toy, ToyState, categorical
 
-from mjx_reinforce.engine.play import counter, episode, rollouts
+from mjx_reinforce.engine import episode
+from mjx_reinforce.engine.play import counter, rollouts
 
 
 class Plain:

@@ -7,10 +7,9 @@ import pytest
 from players import actor_and_act, only_active, played
 
 from mjx_reinforce import envs, make_vec
-from mjx_reinforce.engine.gpu import ptx
+from mjx_reinforce.engine.gpu import nvrtc, ptx
 from mjx_reinforce.engine.play import available, native
-from mjx_reinforce.engine.team import nvrtc
-from mjx_reinforce.engine.team import program as team
+from mjx_reinforce.engine.play import teams as team
 
 if reason := available.unavailable():
     pytest.skip(reason, allow_module_level=True)

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.gpu.kernel import CONTROLS, RESULTS
-from mjx_reinforce.engine.play import objects
 from mjx_reinforce.engine.scalar import scalarized
 from mjx_reinforce.engine.scalar.jaxprs import num_entries
 from mjx_reinforce.engine.team.operations import type_of

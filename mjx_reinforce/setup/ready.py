@@ -27,8 +27,8 @@ from mjx_reinforce.learning.learner import Learner
 from mjx_reinforce.registry import is_own
 from mjx_reinforce.settings.config import CODE, Config, check_read_by_policy, marked
 from mjx_reinforce.settings.declare import Mark
-from mjx_reinforce.store.build import build, policy_settings
-from mjx_reinforce.store.provenance import provenance, version
+from mjx_reinforce.setup.build import build, policy_settings
+from mjx_reinforce.setup.provenance import provenance, version
 from mjx_reinforce.training.division import ALONE, Division
 from mjx_reinforce.training.programs import Programs, programs_of
 from mjx_reinforce.training.resume import recordable

@@ -19,13 +19,12 @@ from toys import Survive
 from mjx_reinforce import envs
 from mjx_reinforce.console import jax_setup
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.engine import cache
+from mjx_reinforce.engine import cache, objects
 from mjx_reinforce.engine.cpu import machine, seam
 from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.gpu import seam as gpu
-from mjx_reinforce.engine.play import objects
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.store import compile_times, ready
+from mjx_reinforce.setup import compile_times, ready
 from mjx_reinforce.training.slots import compile_run
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=4000, eval_episodes=2)
@@ -317,7 +316,7 @@ def test_a_tree_of_other_classes_is_neither_described_nor_rebuilt():
 _SECOND = """
 import jax, numpy, sys
 from mjx_reinforce import envs
-from mjx_reinforce.store import ready
+from mjx_reinforce.setup import ready
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.training.slots import compile_run

@@ -3,8 +3,8 @@
 import ctypes
 from typing import Any
 
-from mjx_reinforce.engine.team import nvrtc
-from mjx_reinforce.engine.team.kernel import Physics
+from mjx_reinforce.engine.gpu import nvrtc
+from mjx_reinforce.engine.gpu.team_kernel import Physics
 
 #: Models of fewer degrees of freedom play faster by a thread an episode.
 _LEAST_DOFS = 14

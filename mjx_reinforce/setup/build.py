@@ -29,7 +29,7 @@ from mjx_reinforce.registry import (
     load_definition,
 )
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.store.room import check_networks
+from mjx_reinforce.setup.room import check_networks
 from mjx_reinforce.training import wrappers
 
 

@@ -9,11 +9,11 @@ import pytest
 from command_lines import run_command
 
 from mjx_reinforce import load, sweep
-from mjx_reinforce.engine.play import objects
+from mjx_reinforce.engine import objects
 from mjx_reinforce.envs import make
 from mjx_reinforce.settings.config import Config, check
-from mjx_reinforce.store import ready
-from mjx_reinforce.store.build import build
+from mjx_reinforce.setup import ready
+from mjx_reinforce.setup.build import build
 
 SOURCE = """
 import dataclasses

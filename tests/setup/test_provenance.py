@@ -9,8 +9,8 @@ import jax
 import pytest
 from places import ROOT
 
-from mjx_reinforce.store import provenance as module
-from mjx_reinforce.store.provenance import provenance, version
+from mjx_reinforce.setup import provenance as module
+from mjx_reinforce.setup.provenance import provenance, version
 
 
 def test_it_is_what_json_can_hold():
@@ -34,10 +34,10 @@ def test_the_commit_is_one_of_the_checkout():
 
 def test_the_commit_is_the_last_that_changed_the_package(tmp_path, monkeypatch):
     package, tasks = tmp_path / "mjx_reinforce", tmp_path / "envs"
-    (package / "store").mkdir(parents=True)
+    (package / "setup").mkdir(parents=True)
     tasks.mkdir()
     (package / "envs").symlink_to("../envs")
-    copy = shutil.copy(module.__file__, package / "store" / "provenance.py")
+    copy = shutil.copy(module.__file__, package / "setup" / "provenance.py")
     monkeypatch.setattr(module, "__file__", str(copy))
     git = ["git", "-C", tmp_path, "-c", "user.name=A", "-c", "user.email=a@example.org"]
     subprocess.run([*git, "init", "-q"], check=True)
