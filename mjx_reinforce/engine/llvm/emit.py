@@ -56,13 +56,13 @@ class LLVM(Backend[Value]):
         """
         self._text = text
         self._inputs = inputs
-        # Where a loop before has kept a value: the array of that value, and the iteration.
-        self._kept: dict[Scalar, tuple[str, int]] = {}
+        # Where an earlier loop has recorded a value: the array of that value, and the iteration.
+        self._recorded: dict[Scalar, tuple[str, int]] = {}
         # Where a node is stored as soon as it is known: in a carry that changes in place.
         self._stored: dict[Node, Memory] = {}
         self._reads: Counter[Node] = Counter()
-        # Such places that loops in the body that is being written have left.
-        self._left: set[Value] = set()
+        # Such places whose loops have ended, of the body that is being written.
+        self._free_places: set[Value] = set()
 
     def compile(self, schedule: Schedule, outputs: list[list[Scalar]]) -> Any:
         """Writes a whole program; returns the value of each element of each output."""
@@ -78,6 +78,7 @@ class LLVM(Backend[Value]):
         """An input stays in memory."""
         number, position = node.position
         pointer, dtype, align = self._inputs(number)
+        # The alignment of the first place holds here as far as it divides the distance of the two.
         align = math.gcd(align, dtype.itemsize * position)
         return Memory(self._text.at(pointer, dtype, position), dtype, align)
 
@@ -93,18 +94,19 @@ class LLVM(Backend[Value]):
         op = cast(Op, node.op)  # leaves are not scheduled
         named = zip(node.args, cast(list[str], operands), strict=True)
         lanes = [Lanes(self._text, np.dtype(arg.dtype), name) for arg, name in named]
-        made = OPERATIONS[op.name](op, node.dtype, *lanes).name
+        name = OPERATIONS[op.name](op, node.dtype, *lanes).name
         if node in self._stored:
-            self._text.store(made, self._stored[node].pointer, node.dtype)
-        return made
+            self._text.store(name, self._stored[node].pointer, node.dtype)
+        return name
 
     def inside(
-        self, body: Schedule, values: dict[Node, Value], known: Mapping[Node, Value] | None = None
+        self, body: Schedule, values: dict[Node, Value], leaves: Mapping[Node, Value] | None = None
     ) -> dict[Node, Value]:
         """Runs a body; it may run again, and must find what is outside as it was."""
-        before, self._left = self._left, set()
-        inner = super().inside(body, values, known)
-        self._left = before
+        before = self._free_places
+        self._free_places = set()
+        inner = super().inside(body, values, leaves)
+        self._free_places = before
         return inner
 
     def some(self, mask: str) -> str:
@@ -115,13 +117,18 @@ class LLVM(Backend[Value]):
         """Writes a branch that is taken if some lane needs it."""
         text = self._text
         needed = self.some(self.value(gate.predicate, values))
+        # What the branch stores in place needs no phi: the old value stays if it is skipped.
         outs = [out for out in gate.outs if out.hot not in self._stored]
+        # The phi takes them from the block before the branch, so they must be known there.
         cold = [self.value(out.cold, values) for out in outs]
-        before, hot_block, after = text.block, text.label(), text.label()
+        before = text.block
+        hot_block = text.label()
+        after = text.label()
         text.line(f"br i1 {needed}, label %{hot_block}, label %{after}")
         text.start(hot_block)
         inner = self.inside(gate.body, values)
         hot = [self.value(out.hot, inner) for out in outs]
+        # Gates and loops in the branch start blocks of their own, so it may end in another block.
         hot_end = text.block
         text.line(f"br label %{after}")
         text.start(after)
@@ -136,54 +143,78 @@ class LLVM(Backend[Value]):
     def loop(self, loop: LiveLoop, values: dict[Node, Value]) -> Sequence[Value]:
         """Writes a loop, which ends when no lane goes on or its length is reached."""
         text = self._text
-        known = self._in_place(loop, values)
+        leaves = self._in_place(loop, values)
+        # A loop that runs at least once has its test at the end. It ends with what its last
+        # iteration computed, so that a carry that the body does not read needs no phi.
         at_least_once = bool(loop.length) and loop.active is None
-        idle = known.keys() | (liveness.unread(loop) if at_least_once else set())
-        carries = [carry for carry in loop.carries if carry.leaf not in idle]
+        without_phi = set(leaves)
+        if at_least_once:
+            without_phi |= liveness.unread(loop)
+        carries = [carry for carry in loop.carries if carry.leaf not in without_phi]
         inits = [self.value(carry.init, values) for carry in carries]
         readers = [self._reader(e.leaf, e.values, values) for e in loop.elements]
-        kept = [text.reserve(r.value.dtype, loop.length or 0) for r in loop.records]
-        before, head, after = text.block, text.label(), text.label()
+        arrays = [text.reserve(r.value.dtype, loop.length or 0) for r in loop.records]
+        before = text.block
+        head = text.label()
+        after = text.label()
         text.line(f"br label %{head}")
         text.start(head)
+        # A phi reads what the body's end computes, and is written when that is known. The first is
+        # the number of the iteration.
         holes = [text.hole() for _ in range(len(carries) + 1)]
         count, *names = [hole.name for hole in holes]
-        known.update(zip((carry.leaf for carry in carries), names, strict=True))
-        active = None if loop.active is None else self.value(loop.carries[loop.active].leaf, known)
+        leaves.update(zip((carry.leaf for carry in carries), names, strict=True))
+        active = None
+        if loop.active is not None:
+            active = self.value(loop.carries[loop.active].leaf, leaves)
         if not at_least_once:
             body = text.label()
             text.line(f"br i1 {self.goes_on(loop, count, active)}, label %{body}, label %{after}")
             text.start(body)
         skipped = self.may_skip(active)
         for element, reader in zip(loop.elements, readers, strict=True):
-            known[element.leaf] = reader(count)
-        inner = self.inside(loop.body, values, known)
-        for record, array in zip(loop.records, kept, strict=True):
+            leaves[element.leaf] = reader(count)
+        inner = self.inside(loop.body, values, leaves)
+        for record, array in zip(loop.records, arrays, strict=True):
             dtype = record.value.dtype
-            text.store(self.value(record.value, inner), self._text.at(array, dtype, count), dtype)
+            text.store(self.value(record.value, inner), text.at(array, dtype, count), dtype)
         nexts = [self.value(carry.next, inner) for carry in carries]
         kinds = [text.type(carry.leaf.dtype) for carry in carries]
         if skipped:
             nexts = self._joined(*skipped, kinds, names, nexts)
         nexts = [text.let(f"add i64 {count}, 1"), *nexts]
-        again = self.goes_on(loop, nexts[0], active) if at_least_once else None
+        branch = f"br label %{head}"
+        if at_least_once:
+            runs_again = self.goes_on(loop, nexts[0], active)
+            branch = f"br i1 {runs_again}, label %{head}, label %{after}"
         for hole, kind, init, following in zip(
             holes, ["i64", *kinds], ["0", *inits], nexts, strict=True
         ):
             text.fill(hole, f"phi {kind} [{init}, %{before}], [{following}, %{text.block}]")
-        ends_or_not = f"i1 {again}, label %{head}, label %{after}" if again else f"label %{head}"
-        text.line(f"br {ends_or_not}{self.BACK}")
+        text.line(branch + self.BACK)
         text.start(after)
-        for record, array in zip(loop.records, kept, strict=True):
-            self._kept.update({out: (array, t) for t, out in enumerate(record.outs)})
-        ends = [
-            super(LLVM, self).value(carry.next, inner) if at_least_once else known[carry.leaf]
-            for carry in loop.carries
-        ]
-        for record, array in zip(loop.records, kept, strict=True):
+        # A loop that is left from its head ends with what the phis there hold. What lies in memory
+        # is loaded only where it is read.
+        if at_least_once:
+            finals = [super(LLVM, self).value(carry.next, inner) for carry in loop.carries]
+        else:
+            finals = [leaves[carry.leaf] for carry in loop.carries]
+        return [*finals, *self._recorded_values(loop, arrays)]
+
+    def _recorded_values(self, loop: LiveLoop, arrays: list[str]) -> list[Value]:
+        """Returns where each iteration's value of each record lies, for what comes after the loop.
+
+        Args:
+          loop: which has ended.
+          arrays: pointers to the values of each record.
+        """
+        places: list[Value] = []
+        for record, array in zip(loop.records, arrays, strict=True):
             dtype = record.value.dtype
-            ends += [Memory(text.at(array, dtype, t), dtype) for t in range(len(record.outs))]
-        return ends
+            for t, out in enumerate(record.outs):
+                self._recorded[out] = (array, t)
+                places.append(Memory(self._text.at(array, dtype, t), dtype))
+        return places
 
     def _in_place(self, loop: LiveLoop, values: dict[Node, Value]) -> dict[Node, Value]:
         """Writes the starts of the carries that change in place; returns where each leaf lies.
@@ -191,19 +222,23 @@ class LLVM(Backend[Value]):
         Few carries stay in registers. What only this loop reads of such a loop before it in the
         same body stays where it is.
         """
-        changed = liveness.accumulators(loop)
-        if len(changed) < self.MANY:
+        accumulators = liveness.accumulators(loop)
+        if len(accumulators) < self.MANY:
             return {}
         places: dict[Node, Value] = {}
-        for node, carry in changed.items():
+        for node, carry in accumulators.items():
             start = super().value(carry.init, values)
-            if start in self._left and self._reads[carry.init] == 1:
+            # This loop may write over the place of an earlier loop of the same body, if nothing
+            # else reads it. What lies outside of the body must stay as it is for the body's next
+            # run.
+            if start in self._free_places and self._reads[carry.init] == 1:
                 place = cast(Memory, start)
             else:
                 place = Memory(self._text.reserve(node.dtype, 1), node.dtype)
                 self._text.store(self.value(carry.init, values), place.pointer, place.dtype)
-            places[carry.leaf] = self._stored[node] = place
-        self._left.update(places.values())
+            places[carry.leaf] = place
+            self._stored[node] = place
+        self._free_places.update(places.values())
         return places
 
     def may_skip(self, active: str | None) -> tuple[str, str] | None:
@@ -218,7 +253,8 @@ class LLVM(Backend[Value]):
         self, before: str, after: str, kinds: list[str], olds: list[str], news: list[str]
     ) -> list[str]:
         """Ends a body that may have been skipped; returns the carries."""
-        text, end = self._text, self._text.block
+        text = self._text
+        end = text.block
         text.line(f"br label %{after}")
         text.start(after)
         return [
@@ -241,38 +277,60 @@ class LLVM(Backend[Value]):
     def _reader(
         self, leaf: Node, row: list[Scalar], values: dict[Node, Value]
     ) -> Callable[[str], Value]:
-        """Returns what an element is in the iteration of a number, an i64."""
-        text, dtype = self._text, leaf.dtype
-        is_input = lambda x: isinstance(x, Node) and x.op is None and x.owner is None  # noqa: E731
-        spaced = liveness.evenly_spaced([x.position if is_input(x) else None for x in row])
+        """Returns what an element is in the iteration of a number, an i64.
+
+        A row that lies in memory already is read there: in an argument, or where an earlier loop
+        has recorded it. Constants become a table. Other values are stored in front of the loop.
+        """
+        text = self._text
+        dtype = leaf.dtype
+        spaced = liveness.evenly_spaced([_place_in_input(x) for x in row])
         if spaced:
             return lambda count: self._place(*spaced, dtype, count)
-        kept = self._kept_in_order(row)
-        if kept is not None:
-            kept_in, first = kept
-            index = lambda count: text.let(f"sub i64 {first}, {count}") if first else count  # noqa: E731
-            return lambda count: Memory(text.at(kept_in, dtype, index(count)), dtype)
+        recorded = self._recorded_in_order(row)
+        if recorded is not None:
+            source, first = recorded
+
+            def read(count: str) -> Value:
+                index = count
+                if first:
+                    index = text.let(f"sub i64 {first}, {count}")
+                return Memory(text.at(source, dtype, index), dtype)
+
+            return read
         if all(map(is_constant, row)):
             table = text.table(dtype, [literal(x) for x in row])
             return lambda count: text.spread(dtype, table, count)
-        array = self._text.reserve(dtype, len(row))
+        array = text.reserve(dtype, len(row))
         for t, x in enumerate(row):
-            text.store(self.value(x, values), self._text.at(array, dtype, t), dtype)
-        return lambda count: Memory(self._text.at(array, dtype, count), dtype)
+            text.store(self.value(x, values), text.at(array, dtype, t), dtype)
+        return lambda count: Memory(text.at(array, dtype, count), dtype)
 
-    def _kept_in_order(self, row: list[Scalar]) -> tuple[str, int] | None:
-        """Returns the array in which an earlier loop has kept these values, and where the first is.
+    def _recorded_in_order(self, row: list[Scalar]) -> tuple[str, int] | None:
+        """Returns the array in which an earlier loop recorded these values, and where the first is.
 
         They are there from the start on, or backwards to the start; None if they are not.
         """
-        array, first = self._kept.get(row[0], (None, 0))
+        array, first = self._recorded.get(row[0], (None, 0))
+        if array is None:
+            return None
         step = -1 if first else 1
-        in_order = all(self._kept.get(x) == (array, first + step * t) for t, x in enumerate(row))
-        return (array, first) if array and in_order else None
+        if any(self._recorded.get(x) != (array, first + step * t) for t, x in enumerate(row)):
+            return None
+        return array, first
 
     def _place(self, leaf: int, start: int, stride: int, dtype: np.dtype, count: str) -> Value:
+        """Returns where in an argument the element of an iteration lies."""
         pointer, _, align = self._inputs(leaf)
         step = self._text.let(f"mul i64 {count}, {stride}")
         index = self._text.let(f"add i64 {step}, {start}")
+        # Every place that the loop reads is a multiple of this.
         align = math.gcd(align, dtype.itemsize * stride, dtype.itemsize * start)
         return Memory(self._text.at(pointer, dtype, index), dtype, align)
+
+
+def _place_in_input(scalar: Scalar) -> tuple[int, int] | None:
+    """Returns the number of the argument that a scalar is in and its place there, or None."""
+    if isinstance(scalar, Node) and scalar.op is None and scalar.owner is None:
+        return scalar.position
+    return None

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from mjx_reinforce.engine.llvm.text import Text
+from mjx_reinforce.engine.llvm.text import Text, sign_letter
 
 INFINITY = float("inf")
 #: x + ROUND - ROUND is the integer nearest to a float32 x, |x| < 2^22, and the lowest bits of
@@ -20,7 +20,9 @@ def _writes(on_floats: str, on_integers: str = "") -> Any:
     """Returns an operator: an instruction on floats, and one on integers where it is another."""
 
     def operator(x: "Lanes", y: "Lanes | float") -> "Lanes":
-        return x.write(on_floats if x.dtype.kind == "f" else on_integers or on_floats, y)
+        if x.dtype.kind == "f" or not on_integers:
+            return x.write(on_floats, y)
+        return x.write(on_integers, y)
 
     return operator
 
@@ -67,32 +69,36 @@ class Lanes:
     __lshift__, __rshift__ = map(_writes, ("shl", "ashr"))
     __lt__, __le__, __gt__, __ge__ = map(_compares, ("lt", "le", "gt", "ge"))
 
-    def __rsub__(self, other):
-        return self.like(other) - self
+    def __rsub__(self, minuend):
+        return self.like(minuend) - self
 
-    def __rtruediv__(self, other):
-        return self.like(other) / self
+    def __rtruediv__(self, dividend):
+        return self.like(dividend) / self
 
     def __neg__(self):
         return self.write("fneg")
 
-    def compare(self, predicate: str, other: "Lanes | float") -> "Lanes":
+    def compare(self, predicate: str, right: "Lanes | float") -> "Lanes":
         """Returns a mask: "eq", "ne", "lt", "le", "gt" or "ge"; with NaN only "ne" is true."""
         if self.dtype.kind == "f":
-            instruction = f"fcmp {'u' if predicate == 'ne' else 'o'}{predicate}"
+            # "Unordered" comparisons are true with NaN, "ordered" ones false.
+            instruction = "fcmp une" if predicate == "ne" else f"fcmp o{predicate}"
+        elif predicate in ("eq", "ne"):
+            instruction = f"icmp {predicate}"
         else:
-            sign = "" if predicate in ("eq", "ne") else "s" if self.dtype.kind == "i" else "u"
-            instruction = f"icmp {sign}{predicate}"
-        return self.write(instruction, other, dtype=bool)
+            instruction = f"icmp {sign_letter(self.dtype)}{predicate}"
+        return self.write(instruction, right, dtype=bool)
 
     def where(self, yes: "Lanes | float", no: "Lanes | float") -> "Lanes":
         """Returns one value where this mask is set and the other where it is not."""
-        of = yes if isinstance(yes, Lanes) else no
-        assert isinstance(of, Lanes)
-        kind = self.text.type(of.dtype)
-        yes, no = of.like(yes), of.like(no)
+        # One of the two may be a Python number, and then has the dtype of the other.
+        typed = yes if isinstance(yes, Lanes) else no
+        assert isinstance(typed, Lanes)
+        kind = self.text.type(typed.dtype)
+        yes = typed.like(yes)
+        no = typed.like(no)
         mask = f"{self.text.type(bool)} {self.name}"
-        return of.named(self.text.let(f"select {mask}, {kind} {yes.name}, {kind} {no.name}"))
+        return typed.named(self.text.let(f"select {mask}, {kind} {yes.name}, {kind} {no.name}"))
 
     def named(self, name: str) -> "Lanes":
         """Returns another operand of this dtype."""
@@ -118,7 +124,7 @@ class Lanes:
 
     def polynomial(self, *coefficients: float) -> "Lanes":
         """Returns the polynomial of this with these coefficients, the highest power first."""
-        result = self.like(coefficients[0])
-        for c in coefficients[1:]:
-            result = result * self + c
-        return result
+        value = self.like(coefficients[0])
+        for coefficient in coefficients[1:]:
+            value = value * self + coefficient
+        return value

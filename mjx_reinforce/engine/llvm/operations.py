@@ -7,13 +7,15 @@ import numpy as np
 
 from mjx_reinforce.engine.llvm.lanes import INFINITY, Lanes
 from mjx_reinforce.engine.llvm.math import FUNCTIONS
-from mjx_reinforce.engine.llvm.text import scalar_type
+from mjx_reinforce.engine.llvm.text import scalar_type, sign_letter
 from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive
 from mjx_reinforce.engine.scalar.nodes import FACTS, Op
 
 #: (operation, dtype of the result, operands) -> the result
 Emit = Callable[..., Lanes]
 
+#: Which comparison with the second operand the one that is taken meets.
+_ORDERS = {"max": "gt", "min": "lt"}
 _COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
 
 
@@ -27,23 +29,26 @@ def _extreme(op: Op, dtype: np.dtype, x: Lanes, y: Lanes) -> Lanes:
     if dtype == np.bool_:
         return x | y if op.name == "max" else x & y
     if dtype.kind != "f":
-        return x.call(f"{'s' if dtype.kind == 'i' else 'u'}{op.name}", y)
-    if is_constant_text(x.name):  # a constant is not NaN, and one comparison is enough
+        return x.call(sign_letter(dtype) + op.name, y)
+    if is_constant_text(x.name):
         x, y = y, x
-    order = "gt" if op.name == "max" else "lt"
+    order = _ORDERS[op.name]
+    # x is taken where it is NaN, and y, by a comparison that is false, where y is. A constant is
+    # not NaN: beside it one comparison, true with NaN, is enough.
     if is_constant_text(y.name):
-        first = x.write(f"fcmp u{order}", y, dtype=bool)
+        takes_x = x.write(f"fcmp u{order}", y, dtype=bool)
     else:
-        first = x.compare(order, y) | x.write("fcmp uno", x, dtype=bool)
-    return first.where(x, y)
+        takes_x = x.compare(order, y) | x.write("fcmp uno", x, dtype=bool)
+    return takes_x.where(x, y)
 
 
-def _select(op: Op, dtype: np.dtype, which: Lanes, *cases: Lanes) -> Lanes:
+def _select(op: Op, dtype: np.dtype, index: Lanes, *cases: Lanes) -> Lanes:
     """Picks the case that the first operand numbers."""
     chosen = cases[0]
     for number, case in enumerate(cases[1:], start=1):
-        is_bool = which.dtype == np.bool_
-        mask = which if is_bool else which.write("icmp sge", number, dtype=bool)
+        mask = index
+        if index.dtype != np.bool_:
+            mask = index.write("icmp sge", number, dtype=bool)
         chosen = mask.where(case, chosen)
     return chosen
 
@@ -53,44 +58,53 @@ def _divide(op: Op, dtype: np.dtype, x: Lanes, y: Lanes) -> Lanes:
 
     A processor stops the program where it divides by an integer zero, or the least one by -1.
     """
+    is_division = op.name == "div"
     if dtype.kind == "f":
-        return x / y if op.name == "div" else x.write("frem", y)
-    is_signed, ones = dtype.kind == "i", x.like(~dtype.type(0))
+        return x / y if is_division else x.write("frem", y)
+    is_signed = dtype.kind == "i"
+    minus_1 = x.like(~dtype.type(0))  # of unsigned integers the greatest
 
-    def by(number: Lanes | int, chosen: Lanes | int, otherwise: Lanes) -> Lanes:
+    def where_y_is(number: Lanes | int, chosen: Lanes | int, otherwise: Lanes) -> Lanes:
         return y.compare("eq", number).where(chosen, otherwise)
 
-    divisor = by(0, 1, y)
+    # Lanes whose divisor is 0 or -1 divide by 1 instead, and their results are put in afterwards.
+    # The rest of a division by -1 is the same 0 as that by 1.
+    divisor = where_y_is(0, 1, y)
     if is_signed:
-        divisor = by(ones, 1, divisor)
-    result = x.write(("s" if is_signed else "u") + op.name, divisor)
-    if is_signed and op.name == "div":
-        result = by(ones, 0 - x, result)
-    return by(0, ones if op.name == "div" else x, result)
+        divisor = where_y_is(minus_1, 1, divisor)
+    quotient = x.write(sign_letter(dtype) + op.name, divisor)
+    if is_signed and is_division:
+        quotient = where_y_is(minus_1, 0 - x, quotient)
+    return where_y_is(0, minus_1 if is_division else x, quotient)
 
 
 def _shift(instruction: str) -> Emit:
     """A shift; by as many bits as there are, or more, nothing is left but copies of the sign."""
 
     def emit(op: Op, dtype: np.dtype, x: Lanes, y: Lanes) -> Lanes:
+        """Shifts by y; LLVM leaves a shift by more undefined, and a negative y is more too."""
         last = dtype.itemsize * 8 - 1
         inside = y.write("icmp ule", last, dtype=bool)
         shifted = x.write(instruction, inside.where(y, last))
-        return shifted if instruction == "ashr" else inside.where(shifted, 0)
+        if instruction == "ashr":
+            return shifted
+        return inside.where(shifted, 0)
 
     return emit
 
 
 def _invert(op: Op, dtype: np.dtype, x: Lanes) -> Lanes:
-    return x ^ x.like(True if dtype == np.bool_ else ~dtype.type(0))
+    return x ^ x.like(~dtype.type(0))
 
 
 def _sign(op: Op, dtype: np.dtype, x: Lanes) -> Lanes:
     """-1, 0 or 1; zeros and NaN stay as they are, and no unsigned number is negative."""
-    result = x if dtype.kind == "f" else x.like(0)
-    for order, value in (("gt", 1), ("lt", -1))[: 1 if dtype.kind == "u" else 2]:
-        result = x.compare(order, 0).where(value, result)
-    return result
+    # Comparisons with NaN are false and leave it; a zero keeps its own sign.
+    sign = x if dtype.kind == "f" else x.like(0)
+    sign = x.compare("gt", 0).where(1, sign)
+    if dtype.kind == "u":
+        return sign
+    return x.compare("lt", 0).where(-1, sign)
 
 
 def _is_finite(op: Op, dtype: np.dtype, x: Lanes) -> Lanes:
@@ -112,24 +126,43 @@ def _count_zeros(op: Op, dtype: np.dtype, x: Lanes) -> Lanes:
     """Leading zeros: the bits below the highest one are set, and what is not set is counted."""
     shift = 1
     while shift < dtype.itemsize * 8:
-        x, shift = x | x.write("lshr", shift), shift * 2
+        x = x | x.write("lshr", shift)
+        shift *= 2
     return _invert(op, dtype, x).call("ctpop")
 
 
 def _convert(op: Op, dtype: np.dtype, x: Lanes) -> Lanes:
     """As XLA does it: a float out of an integer's range becomes the nearest, NaN becomes 0."""
     before = x.dtype
+    widens = dtype.itemsize > before.itemsize
     if dtype == np.bool_:
         return x.compare("ne", 0)
     if dtype.kind == "f":
         if before.kind == "f":
-            return x.convert("fpext" if dtype.itemsize > before.itemsize else "fptrunc", dtype)
-        return x.convert("sitofp" if before.kind == "i" else "uitofp", dtype)
+            return x.convert("fpext" if widens else "fptrunc", dtype)
+        return x.convert(f"{sign_letter(before)}itofp", dtype)
     if before.kind == "f":
+        # LLVM's plain conversion is undefined out of the range.
         return x.named(x.text.saturate(dtype, before, x.name))
-    if before == np.bool_ or dtype.itemsize > before.itemsize:
+    # A bool is a byte in NumPy and a bit here, so that it widens to a byte too.
+    if before == np.bool_ or widens:
         return x.convert("sext" if before.kind == "i" else "zext", dtype)
-    return x if scalar_type(dtype) == scalar_type(before) else x.convert("trunc", dtype)
+    if scalar_type(dtype) == scalar_type(before):
+        return x
+    return x.convert("trunc", dtype)
+
+
+def _bitcast(op: Op, dtype: np.dtype, x: Lanes) -> Lanes:
+    # LLVM has one type for signed and unsigned integers.
+    if scalar_type(dtype) == scalar_type(x.dtype):
+        return x
+    return x.convert("bitcast", dtype)
+
+
+def _absolute(op: Op, dtype: np.dtype, x: Lanes) -> Lanes:
+    if dtype.kind == "f":
+        return abs(x)
+    return _extreme(Op("max"), dtype, x, 0 - x)
 
 
 def _math(op: Op, dtype: np.dtype, *operands: Lanes) -> Lanes:
@@ -144,7 +177,7 @@ OPERATIONS: dict[str, Emit] = {
     **dict.fromkeys(FACTS, _absent),
     **dict.fromkeys(FUNCTIONS["float32"], _math),
     **dict.fromkeys(_COMPARISONS, lambda op, _, x, y: x.compare(op.name, y)),
-    **dict.fromkeys(("max", "min"), _extreme),
+    **dict.fromkeys(_ORDERS, _extreme),
     **dict.fromkeys(("div", "rem"), _divide),
     **{name: _unary(name) for name in ("floor", "ceil", "sqrt")},
     "add": lambda op, dtype, x, y: x + y,
@@ -159,9 +192,7 @@ OPERATIONS: dict[str, Emit] = {
     "shift_right_arithmetic": _shift("ashr"),
     "neg": lambda op, dtype, x: -x if dtype.kind == "f" else 0 - x,
     "not": _invert,
-    "abs": lambda op, dtype, x: (
-        abs(x) if dtype.kind == "f" else _extreme(Op("max"), dtype, x, 0 - x)
-    ),
+    "abs": _absolute,
     "sign": _sign,
     "is_finite": _is_finite,
     "rsqrt": lambda op, dtype, x: x.like(1).write("fdiv", x.call("sqrt")),
@@ -169,7 +200,5 @@ OPERATIONS: dict[str, Emit] = {
     "clz": _count_zeros,
     "population_count": _unary("ctpop"),
     "convert_element_type": _convert,
-    "bitcast_convert_type": lambda op, dtype, x: (
-        x if scalar_type(dtype) == scalar_type(x.dtype) else x.convert("bitcast", dtype)
-    ),
+    "bitcast_convert_type": _bitcast,
 }

@@ -45,13 +45,21 @@ def _scalar_type(dtype: np.dtype) -> str:
     return _SCALARS[dtype.name]
 
 
+def sign_letter(dtype: np.dtype) -> str:
+    """Returns how LLVM marks what it does with integers of a dtype: signed or unsigned."""
+    return "s" if dtype.kind == "i" else "u"
+
+
 def literal(number: Any) -> str:
     """Returns a NumPy scalar as LLVM writes it."""
     number = np.asarray(number)
     if number.dtype == np.bool_:
         return "true" if number else "false"
-    if number.dtype.kind == "f":  # the bits of the double that has the same value
-        return f"0x{struct.unpack('<Q', struct.pack('<d', float(number)))[0]:016X}"
+    if number.dtype.kind == "f":
+        # The bits of the double of the same value, for float32 too. LLVM refuses a decimal that the
+        # type does not hold exactly.
+        (bits,) = struct.unpack("<Q", struct.pack("<d", float(number)))
+        return f"0x{bits:016X}"
     return str(int(number))
 
 
@@ -96,6 +104,8 @@ class Text:
     def function(self, signature: str) -> str:
         """Returns a module with a function of this signature, such as "void @f(ptr %x)"."""
         tables = [f"{name} = internal constant {table}" for table, name in self._tables.items()]
+        # What is reserved stands in a block of its own in front: there LLVM turns what is small
+        # into registers, and a loop does not reserve it again and again.
         body = ["entry:", *self._reserved, "  br label %start", "start:", *self._lines]
         lines = [*tables, f"define {signature} {{", *body, "}", *sorted(self.declared)]
         return "\n".join(lines) + "\n"
@@ -103,7 +113,9 @@ class Text:
     def type(self, dtype: DTypeLike) -> str:
         """Returns the type of a lane vector."""
         scalar = scalar_type(dtype)
-        return scalar if self.lanes == 1 else f"<{self.lanes} x {scalar}>"
+        if self.lanes == 1:
+            return scalar
+        return f"<{self.lanes} x {scalar}>"
 
     def constant(self, number: Any) -> str:
         """Returns a NumPy scalar as a lane vector that has it in every lane."""
@@ -128,14 +140,17 @@ class Text:
 
     def call(self, function: str, dtype: DTypeLike, *operands: str) -> str:
         """Calls an intrinsic such as "llvm.sqrt" on lane vectors of one dtype."""
-        kind, name = self.type(dtype), f"@{function}.{self._suffix(dtype)}"
+        kind = self.type(dtype)
+        name = f"@{function}.{self._suffix(dtype)}"
         self.declared.add(f"declare {kind} {name}({', '.join([kind] * len(operands))})")
         return self.let(f"call {kind} {name}({', '.join(f'{kind} {x}' for x in operands)})")
 
     def _suffix(self, dtype: DTypeLike) -> str:
         """Returns how intrinsics' names end for lane vectors, such as "v8f32"."""
         scalar = {"float": "f32", "double": "f64"}.get(scalar_type(dtype), scalar_type(dtype))
-        return scalar if self.lanes == 1 else f"v{self.lanes}{scalar}"
+        if self.lanes == 1:
+            return scalar
+        return f"v{self.lanes}{scalar}"
 
     def label(self) -> str:
         """Returns the name of a basic block to come."""
@@ -146,6 +161,7 @@ class Text:
         """Begins a basic block."""
         self._lines.append(f"{block}:")
         self.block = block
+        # The next block may be entered from elsewhere, where nothing of this one was computed.
         self._known = {}
 
     def once(self, key: Hashable, write: Callable[[], Written]) -> Written:
@@ -174,14 +190,16 @@ class Text:
     @contextmanager
     def when(self, condition: str) -> Iterator[None]:
         """Writes what is done only if an i1 is set; what is known before stays known."""
-        inside, after = self.label(), self.label()
-        known = self._known
+        inside = self.label()
+        after = self.label()
+        known_before = self._known
         self.line(f"br i1 {condition}, label %{inside}, label %{after}")
         self.start(inside)
         yield
         self.line(f"br label %{after}")
         self.start(after)
-        self._known = known
+        # The block after is entered from the one before alone, or through the one inside.
+        self._known = known_before
 
     def hole(self) -> Hole:
         """Leaves a line for an instruction that reads what comes later."""
@@ -194,7 +212,8 @@ class Text:
 
     def reserve(self, dtype: DTypeLike, count: int) -> str:
         """Returns a pointer to room for lane vectors, which lasts until the function returns."""
-        name, align = self.name(), max(_LEAST_ALIGN, np.dtype(dtype).itemsize * self.lanes)
+        name = self.name()
+        align = max(_LEAST_ALIGN, np.dtype(dtype).itemsize * self.lanes)
         size = count * np.dtype(dtype).itemsize * self.lanes
         if size > self._stack_left:
             self._allocate(name, size, align)
@@ -205,6 +224,8 @@ class Text:
 
     def _allocate(self, name: str, size: int, align: int) -> None:
         """Writes at the function's start what gives a name to so many bytes of the heap."""
+        # malloc aligns for the largest scalar alone: room for one more alignment is taken, and the
+        # place in it is rounded up.
         room, number, beyond, aligned = (self.name() for _ in range(4))
         self._reserved += [
             f"  {room} = call ptr @malloc(i64 {size + align})",
@@ -232,7 +253,8 @@ class Text:
         """Returns an entry of a table in every lane."""
         scalar = scalar_type(dtype)
         place = self.let(f"getelementptr inbounds {scalar}, ptr {table}, i64 {index}")
-        return self.broadcast(scalar, self.let(f"load {scalar}, ptr {place}"))
+        entry = self.let(f"load {scalar}, ptr {place}")
+        return self.broadcast(scalar, entry)
 
     def broadcast(self, scalar: str, value: str) -> str:
         """Returns a scalar in every lane."""
@@ -248,9 +270,11 @@ class Text:
         return self.let(f"getelementptr inbounds {self.type(dtype)}, ptr {pointer}, i64 {index}")
 
     def load(self, pointer: str, dtype: DTypeLike, align: int = 1) -> str:
-        """Loads a lane vector; ``align`` as of ``llvm.Input``."""
-        suffix = f", align {align}" if align > np.dtype(dtype).itemsize else ""
-        return self.let(f"load {self.type(dtype)}, ptr {pointer}{suffix}")
+        """Loads a lane vector; ``align`` as of ``emit.Memory``."""
+        load = f"load {self.type(dtype)}, ptr {pointer}"
+        if align > np.dtype(dtype).itemsize:
+            load += f", align {align}"
+        return self.let(load)
 
     def store(self, value: str, pointer: str, dtype: DTypeLike) -> None:
         """Stores a lane vector."""
@@ -258,33 +282,39 @@ class Text:
 
     def gather(self, base: str, index: str, dtype: DTypeLike) -> str:
         """Loads for each lane the entry at its own index of an array."""
-        places, kind, lanes = self._places(base, index, dtype), self.type(dtype), self.lanes
-        if lanes == 1:
+        places = self._places(base, index, dtype)
+        kind = self.type(dtype)
+        if self.lanes == 1:
             return self.let(f"load {kind}, ptr {places}")
-        name = f"@llvm.masked.gather.{self._suffix(dtype)}.v{lanes}p0"
-        pointers, bools = f"<{lanes} x ptr>", self.type(bool)
+        name = f"@llvm.masked.gather.{self._suffix(dtype)}.v{self.lanes}p0"
+        pointers = f"<{self.lanes} x ptr>"
+        bools = self.type(bool)
         self.declared.add(f"declare {kind} {name}({pointers}, i32, {bools}, {kind})")
-        align, all_lanes = np.dtype(dtype).itemsize, self.constant(np.True_)
+        align = np.dtype(dtype).itemsize
+        all_lanes = self.constant(np.True_)
         operands = f"{pointers} {places}, i32 {align}, {bools} {all_lanes}, {kind} poison"
         return self.let(f"call {kind} {name}({operands})")
 
     def scatter(self, value: str, base: str, index: str, mask: str, dtype: DTypeLike) -> None:
         """Stores each lane's value at its own index of an array, where the mask is set."""
-        kind, lanes = self.type(dtype), self.lanes
-        if lanes == 1:
+        kind = self.type(dtype)
+        if self.lanes == 1:
             with self.when(mask):
                 self.line(f"store {kind} {value}, ptr {self._places(base, index, dtype)}")
             return
-        places, align = self._places(base, index, dtype), np.dtype(dtype).itemsize
-        name = f"@llvm.masked.scatter.{self._suffix(dtype)}.v{lanes}p0"
-        pointers, bools = f"<{lanes} x ptr>", self.type(bool)
+        places = self._places(base, index, dtype)
+        align = np.dtype(dtype).itemsize
+        name = f"@llvm.masked.scatter.{self._suffix(dtype)}.v{self.lanes}p0"
+        pointers = f"<{self.lanes} x ptr>"
+        bools = self.type(bool)
         self.declared.add(f"declare void {name}({kind}, {pointers}, i32, {bools})")
         operands = f"{kind} {value}, {pointers} {places}, i32 {align}, {bools} {mask}"
         self.line(f"call void {name}({operands})")
 
     def _places(self, base: str, index: str, dtype: DTypeLike) -> str:
         """Returns the pointer to each lane's entry of an array."""
-        scalar, indices = scalar_type(dtype), self.type(np.int64)
+        scalar = scalar_type(dtype)
+        indices = self.type(np.int64)
         return self.let(f"getelementptr inbounds {scalar}, ptr {base}, {indices} {index}")
 
     def mask(self, flags: str) -> str:
@@ -302,8 +332,9 @@ class Text:
 
     def saturate(self, dtype: DTypeLike, before: Any, value: str) -> str:
         """Converts a float to the nearest integer that there is, and NaN to 0."""
-        sign = "s" if np.dtype(dtype).kind == "i" else "u"
-        new, old = self.type(dtype), self.type(before)
+        sign = sign_letter(np.dtype(dtype))
+        new = self.type(dtype)
+        old = self.type(before)
         name = f"@llvm.fpto{sign}i.sat.{self._suffix(dtype)}.{self._suffix(before)}"
         self.declared.add(f"declare {new} {name}({old})")
         return self.let(f"call {new} {name}({old} {value})")

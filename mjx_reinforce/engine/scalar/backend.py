@@ -19,7 +19,7 @@ class Backend(abc.ABC, Generic[Value]):
     branch computes is known only inside, so it is run in an environment of its own (``inside``).
 
     OPERATIONS: what the backend makes of each operation, by name, with an entry for every
-      name of ``ops.FACTS``; None for a backend without a table of its own.
+      name of ``nodes.FACTS``; None for a backend without a table of its own.
     """
 
     OPERATIONS: ClassVar[Mapping[str, Any] | None] = None
@@ -63,25 +63,27 @@ class Backend(abc.ABC, Generic[Value]):
             if isinstance(step, Node):
                 values[step] = self.node(step, [self.value(arg, values) for arg in step.args])
                 continue
+            # Each of these gives a value to every node that stands for one of its results.
             if isinstance(step, LiveLoop):
-                made = self.loop(step, values)
+                step_values = self.loop(step, values)
+            elif isinstance(step, Call):
+                step_values = self.call(step, values)
             else:
-                made = (
-                    self.call(step, values) if isinstance(step, Call) else self.gate(step, values)
-                )
-            values.update(zip(results(step), made, strict=True))
+                step_values = self.gate(step, values)
+            values.update(zip(results(step), step_values, strict=True))
 
     def inside(
-        self, body: Schedule, values: dict[Node, Value], known: Mapping[Node, Value] | None = None
+        self, body: Schedule, values: dict[Node, Value], leaves: Mapping[Node, Value] | None = None
     ) -> dict[Node, Value]:
         """Runs the body of a loop or a gate; returns the values at its end.
 
         Args:
           body: its steps.
           values: the values known around it, left as they are.
-          known: the values of the leaves that the body starts from.
+          leaves: the values of the leaves that the body starts from.
         """
-        inner = {**values, **(known or {})}
+        # A copy: what the body computes is unknown around it, where it may not have run.
+        inner = {**values, **(leaves or {})}
         self.run(body, inner)
         return inner
 
