@@ -43,7 +43,9 @@ def lift(array: Array) -> Array:
 
 def settle(array: Array, dtype: DTypeLike) -> Array:
     """Returns the array as a numeric one if every element is a constant."""
-    return array if is_numeric(array) else pack(array.flat, array.shape, dtype)
+    if is_numeric(array):
+        return array
+    return pack(array.flat, array.shape, dtype)
 
 
 def together(arrays: Sequence[Array]) -> list[Array]:
@@ -73,15 +75,16 @@ class Layout:
 
     def pack(self, scalars: Sequence[Any]) -> list[Array]:
         """Makes the arrays of these scalars."""
-        values, packed = iter(scalars), []
+        values = iter(scalars)
+        packed = []
         for aval, size in zip(self._avals, self._sizes, strict=True):
             packed.append(pack([next(values) for _ in range(size)], aval.shape, aval.dtype))
         return packed
 
     def repeat(self, facts: Sequence[Any]) -> list[Any]:
         """Lists what is known of each array once for each of its scalars."""
-        each = zip(facts, self._sizes, strict=True)
-        return [fact for fact, size in each for _ in range(size)]
+        sized = zip(facts, self._sizes, strict=True)
+        return [fact for fact, size in sized for _ in range(size)]
 
     def unpack(self, packed: Sequence[Array]) -> list[Any]:
         """Lists the scalars of these arrays."""

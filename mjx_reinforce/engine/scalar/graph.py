@@ -30,21 +30,24 @@ class Graph:
       that is written out, and a loop is shorter. A scan whose own ``unroll`` is its whole length is
       always written out, as JAX does.
     path: the equations that are being evaluated, from the outermost one, by their ids.
-    learned: what was found out on a path. The body of a loop is evaluated again and again, each
+    findings: what was found out on a path. The body of a loop is evaluated again and again, each
       time with less assumed of what never changes, and what was found out inside still holds.
-    certain: predicates of the branches and loops around the present scope. Its code runs only
+    premises: predicates of the branches and loops around the present scope. Its code runs only
       if each of them is true for at least one element of the batch.
     """
 
     def __init__(self, branch_cost: int, scans: int):
+        """Starts a graph without nodes, in the scope of the program itself."""
         self.branch_cost = branch_cost
         self.scans = scans
         self.path: tuple[int, ...] = ()
-        self.learned: dict[Hashable, Any] = {}
-        self._evaluated: dict[int, Any] = {}  # kept, so that no id is given twice
-        self.certain: set[Node] = set()
+        self.findings: dict[Hashable, Any] = {}
+        # The equations of all paths so far. Python would give the id of a dropped one to another.
+        self._equations: dict[int, Any] = {}
+        self.premises: set[Node] = set()
         self._scopes = [Scope(depth=0, floor=0)]
-        self._count = self._applied = 0
+        self._num_numbered = 0
+        self._num_applied = 0
 
     @property
     def scope(self) -> Scope:
@@ -54,20 +57,21 @@ class Graph:
     @contextmanager
     def evaluating(self, eqn: jaxprs.Equation) -> Iterator[None]:
         """Lengthens the path by an equation."""
-        self._evaluated[id(eqn)] = eqn
-        before, self.path = self.path, (*self.path, id(eqn))
+        self._equations[id(eqn)] = eqn
+        outer_path = self.path
+        self.path = (*outer_path, id(eqn))
         try:
             yield
         finally:
-            self.path = before
+            self.path = outer_path
 
     def source(self, eqn: jaxprs.Equation) -> str:
         """Returns the user's line that an equation is from, or else the innermost call around it.
 
         Inside of a jitted function of JAX no line is the user's.
         """
-        around = [eqn, *(self._evaluated[number] for number in reversed(self.path))]
-        return next(filter(None, map(jaxprs.source, around)), "an unknown line")
+        innermost_first = [eqn, *(self._equations[number] for number in reversed(self.path))]
+        return next(filter(None, map(jaxprs.source, innermost_first)), "an unknown line")
 
     def loop_body(self) -> AbstractContextManager[Scope]:
         """Opens the scope of a loop's body; nodes that do not depend on it are placed outside."""
@@ -79,36 +83,39 @@ class Graph:
 
     @contextmanager
     def _open(self, floor: int) -> Iterator[Scope]:
+        """Opens a scope whose nodes are placed in one at least as deep as ``floor``."""
         scope = Scope(depth=self.scope.depth + 1, floor=floor)
         self._scopes.append(scope)
         try:
             yield scope
         finally:
             self._scopes.pop()
+            # A branch around this scope costs what is inside of it, too.
             self.scope.cost += scope.cost
             self.scope.has_loop |= scope.has_loop
 
     @contextmanager
     def again(self, scope: Scope) -> Iterator[None]:
         """Opens the scope of a branch once more; it is still the innermost's child."""
-        before = scope.cost
+        cost_before = scope.cost
         self._scopes.append(scope)
         try:
             yield
         finally:
             self._scopes.pop()
-            self.scope.cost += scope.cost - before
+            # Its cost up to here was added when it was opened for the first time.
+            self.scope.cost += scope.cost - cost_before
 
     @contextmanager
     def assuming(self, predicate: Scalar) -> Iterator[None]:
         """Assumes in a block that a predicate is true for at least one element of the batch."""
-        before = set(self.certain)
+        outer_premises = set(self.premises)
         if isinstance(predicate, Node):
-            self.certain.add(predicate)
+            self.premises.add(predicate)
         try:
             yield
         finally:
-            self.certain = before
+            self.premises = outer_premises
 
     def leaf(
         self, dtype: DTypeLike, varying: bool, owner: Any = None, position: Any = None
@@ -119,13 +126,16 @@ class Graph:
 
     def number(self) -> int:
         """Returns the next index."""
-        self._count += 1
-        return self._count
+        self._num_numbered += 1
+        return self._num_numbered
 
     def call(self, name: str, *args: Scalar) -> Scalar:
         """Applies one of the named operations to scalars."""
-        predicate = nodes.FACTS[name].is_predicate
-        return self.apply(Op(name), args, nodes.BOOL if predicate else args[-1].dtype)
+        # The last operand has the dtype of the result: of a selection the first is a predicate.
+        dtype = args[-1].dtype
+        if nodes.FACTS[name].is_predicate:
+            dtype = nodes.BOOL
+        return self.apply(Op(name), args, dtype)
 
     def convert(self, value: Scalar, dtype: DTypeLike) -> Scalar:
         """Converts a scalar to another dtype."""
@@ -141,26 +151,39 @@ class Graph:
         operands = [arg for arg in args if isinstance(arg, Node)]
         if not operands:
             return simplify.fold(op, args, dtype)
-        self._applied += 1
-        if self._applied > _MOST:
+        # Every request counts, also one that an existing node answers: it takes its time.
+        self._num_applied += 1
+        if self._num_applied > _MOST:
             raise TooLarge(f"written out it is more than {_MOST:,} scalar operations")
         simpler = simplify.simplify(self, op, args, dtype)
-        return self._share(op, args, operands, dtype) if simpler is None else simpler
+        if simpler is not None:
+            return simpler
+        return self._share(op, args, operands, dtype)
 
     def _share(
         self, op: Op, args: tuple[Scalar, ...], operands: list[Node], dtype: np.dtype
     ) -> Node:
-        keys = [arg if isinstance(arg, Node) else nodes.identity(arg) for arg in args]
-        key = (op, frozenset(keys) if nodes.FACTS[op.name].commutes else tuple(keys))
-        least = max([node.scope.depth for node in operands])  # no node of these is further outside
-        depth = max(self.scope.floor, least)
-        for k in range(depth, least - 1, -1):
-            known = self._scopes[k].known.get(key)
-            if known is not None:
-                return known
+        """Returns the node of an operation, a new one only if there is none.
+
+        Args:
+          op: the operation.
+          args: its operands.
+          operands: those of them that are nodes, at least one.
+          dtype: that of the result.
+        """
+        identities = [arg if isinstance(arg, Node) else nodes.identity(arg) for arg in args]
+        commutes = nodes.FACTS[op.name].commutes
+        key = (op, frozenset(identities) if commutes else tuple(identities))
+        # No node of these operands can be further outside than the innermost of them.
+        outermost = max([node.scope.depth for node in operands])
+        depth = max(self.scope.floor, outermost)
+        for k in range(depth, outermost - 1, -1):
+            equal_node = self._scopes[k].nodes.get(key)
+            if equal_node is not None:
+                return equal_node
         scope = self._scopes[depth]
         varying = any(node.varying for node in operands)
         node = Node(dtype, varying, scope, self.number(), op=op, args=args)
-        scope.known[key] = node
+        scope.nodes[key] = node
         scope.cost += 1
         return node

@@ -106,7 +106,10 @@ def trace(fn: Callable, *examples: PyTree) -> tuple[Program, Any]:
 
 def fingerprint(traced: Program) -> str:
     """Returns a hash of a program and of the constants in it, the same in every process."""
-    digest = hashlib.sha256(re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr)).encode())
+    # The text has addresses of Python objects, and of the owners of operations that stay whole,
+    # which differ in every process.
+    text = re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr))
+    digest = hashlib.sha256(text.encode())
     for const in [*traced.consts, *_inner_constants(traced.jaxpr)]:
         if is_traced(const):
             digest.update(b"unknown")
@@ -118,22 +121,22 @@ def fingerprint(traced: Program) -> str:
 
 def _inner_constants(jaxpr: core.Jaxpr) -> list[Any]:
     """Returns the constants of the programs that a program calls."""
-    found = []
+    constants = []
     for eqn in jaxpr.eqns:
         for inner in subprograms(eqn.params.values()):
-            found += [*inner.consts, *_inner_constants(inner.jaxpr)]
-    return found
+            constants += [*inner.consts, *_inner_constants(inner.jaxpr)]
+    return constants
 
 
 def subprograms(params: Iterable[Any]) -> list[Program]:
     """Returns the programs among the parameters of an equation."""
-    found = []
+    programs = []
     for value in params:
         if isinstance(value, (tuple, list)):
-            found += subprograms(value)
+            programs += subprograms(value)
         elif isinstance(value, core.Jaxpr) or hasattr(type(value), "jaxpr"):  # open, or closed
-            found.append(program(value))
-    return found
+            programs.append(program(value))
+    return programs
 
 
 def program(closed: Any) -> Program:
@@ -156,10 +159,10 @@ def callee(eqn: Equation) -> Program | None:
 
 def words(atom: Atom) -> jax.ShapeDtypeStruct:
     """Returns the shape of an operand, of which a key is an array of words."""
-    shape, dtype = atom.aval.shape, atom.aval.dtype
-    if is_key(atom.aval):
-        shape, dtype = (*shape, *_implementation(atom).key_shape), np.dtype(np.uint32)
-    return jax.ShapeDtypeStruct(shape, dtype)
+    if not is_key(atom.aval):
+        return jax.ShapeDtypeStruct(atom.aval.shape, atom.aval.dtype)
+    shape = (*atom.aval.shape, *_implementation(atom).key_shape)
+    return jax.ShapeDtypeStruct(shape, np.dtype(np.uint32))
 
 
 def on_words(eqn: Any) -> Equation:
@@ -181,16 +184,20 @@ def _implementation(key: Atom) -> Any:
 
 def _largest(eqn: Equation) -> Callable[[jax.Array], list[jax.Array]]:
     """Returns ``top_k`` as a sort: -NaN, -inf, ..., -0, 0, ..., inf, NaN, equal ones in order."""
-    k, axis = eqn.params["k"], eqn.params["axis"]
+    k = eqn.params["k"]
+    axis = eqn.params["axis"]
 
     def largest(x: jax.Array) -> list[jax.Array]:
+        """Sorts by the complement of the order, which turns it around; ties by their positions."""
         order = x
-        if np.issubdtype(x.dtype, np.floating):  # the order of the bits, but of negative numbers
+        if np.issubdtype(x.dtype, np.floating):
+            # As integers, the bits of floats are in the order of the numbers. Those of negative
+            # ones are in the reverse order, and all of them but the sign are inverted.
             bits = lax.bitcast_convert_type(x, f"int{8 * x.dtype.itemsize}")
             order = lax.select(bits < 0, bits ^ np.iinfo(bits.dtype).max, bits)
         places = lax.broadcasted_iota(np.int32, x.shape, axis)
-        _, *found = lax.sort((~order, x, places), dimension=axis)
-        return [lax.slice_in_dim(y, 0, k, axis=axis) for y in found]
+        _, *sorted_arrays = lax.sort((~order, x, places), dimension=axis)
+        return [lax.slice_in_dim(y, 0, k, axis=axis) for y in sorted_arrays]
 
     return largest
 
@@ -218,7 +225,9 @@ def default_platform(eqn: Any) -> int | None:
     default alone is right on every platform.
     """
     platforms = list(eqn.params["platforms"])
-    return platforms.index(None) if None in platforms else None
+    if None not in platforms:
+        return None
+    return platforms.index(None)
 
 
 def scan_parts(eqn: Equation) -> tuple[int, int]:
@@ -265,6 +274,7 @@ def prune(fn: Callable) -> Callable:
 
     @functools.wraps(fn)
     def pruned(*args: PyTree) -> Any:
+        """Traces the function, drops what is dead, and evaluates the rest."""
         leaves, in_tree = jax.tree.flatten(args)
         (jaxpr, consts), out_shape = trace(lambda *flat: fn(*in_tree.unflatten(flat)), *leaves)
         outs = [True] * len(jaxpr.outvars)
@@ -275,21 +285,25 @@ def prune(fn: Callable) -> Callable:
     return pruned
 
 
-def live_equations(jaxpr: core.Jaxpr, used: Iterable[bool]) -> list[Any]:
-    """Returns the equations that the used outputs need, in order.
+def live_equations(jaxpr: core.Jaxpr, live: Iterable[bool]) -> list[tuple[Any, list[bool]]]:
+    """Returns the equations that the live outputs need, in order, and which results of each.
 
     Equations are pure here: one with an effect (a print, a callback) is dropped like any other
     when nothing reads it.
+
+    Args:
+      jaxpr: the equations.
+      live: which of the jaxpr's outputs something reads.
     """
-    needed = {
-        out for out, use in zip(jaxpr.outvars, used, strict=True) if use and not is_literal(out)
-    }
-    kept = []
+    outs = zip(jaxpr.outvars, live, strict=True)
+    needed = {out for out, is_live in outs if is_live and not is_literal(out)}
+    equations = []
+    # Backwards: whoever reads an equation's results comes behind it, and was looked at before.
     for eqn in reversed(jaxpr.eqns):
         if any(out in needed for out in eqn.outvars):
-            kept.append((eqn, [out in needed for out in eqn.outvars]))
+            equations.append((eqn, [out in needed for out in eqn.outvars]))
             needed.update(atom for atom in eqn.invars if not is_literal(atom))
-    return kept[::-1]
+    return equations[::-1]
 
 
 def source(eqn: Equation) -> str:
@@ -303,7 +317,10 @@ def source(eqn: Equation) -> str:
         line = source_info_util.summarize(eqn.source_info)
     except (ImportError, AttributeError):
         return ""
-    return "" if line.startswith(str(Path(__file__).parent)) else line
+    # A line of this package, such as one of ``primitives``, says nothing to the user.
+    if line.startswith(str(Path(__file__).parent)):
+        return ""
+    return line
 
 
 def operation(name: str) -> Callable[..., Any]:
@@ -315,8 +332,10 @@ def compute_constants(
     function: Callable, params: dict, operands: Sequence[Any]
 ) -> list[np.ndarray]:
     """Computes an operation of JAX on constants at once; takes about 1 ms."""
+    # Also while an outer function is traced, where JAX would else trace this too.
     with jax.ensure_compile_time_eval():
         arrays = [jax.numpy.asarray(operand) for operand in operands]
         results = function(*arrays, **params)
-        results = results if isinstance(results, (list, tuple)) else [results]
-        return [np.asarray(result) for result in results]
+        if not isinstance(results, (list, tuple)):
+            results = [results]
+        return [np.asarray(array) for array in results]

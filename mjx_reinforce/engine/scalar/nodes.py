@@ -33,7 +33,6 @@ class Facts(NamedTuple):
     in_numpy: operands -> result; None where NumPy has no one function for it.
     in_jax: the name of a function of ``jax.lax``, (operands, **parameters) -> result; "" where
       that is the name of the operation.
-    arity: how many operands it takes; ``select_n`` takes a number of a case and the cases.
     commutes: whether two operands may change places.
     is_predicate: whether the result is a bool whatever the operands are.
     has_params: whether the parameters of the JAX primitive are part of the operation.
@@ -41,7 +40,6 @@ class Facts(NamedTuple):
 
     in_numpy: Callable[..., Any] | None = None
     in_jax: str = ""
-    arity: int = 1
     commutes: bool = False
     is_predicate: bool = False
     has_params: bool = False
@@ -54,40 +52,36 @@ def _named(*names: str, **facts: Any) -> dict[str, Facts]:
 
 #: Every operation that a rule can make.
 FACTS: dict[str, Facts] = {
-    "add": Facts(np.add, arity=2, commutes=True),
-    "mul": Facts(np.multiply, arity=2, commutes=True),
-    "max": Facts(np.maximum, arity=2, commutes=True),
-    "min": Facts(np.minimum, arity=2, commutes=True),
-    "and": Facts(np.bitwise_and, in_jax="bitwise_and", arity=2, commutes=True),
-    "or": Facts(np.bitwise_or, in_jax="bitwise_or", arity=2, commutes=True),
-    "xor": Facts(np.bitwise_xor, in_jax="bitwise_xor", arity=2, commutes=True),
-    "eq": Facts(np.equal, arity=2, is_predicate=True),
-    "ne": Facts(np.not_equal, arity=2, is_predicate=True),
-    "lt": Facts(np.less, arity=2, is_predicate=True),
-    "le": Facts(np.less_equal, arity=2, is_predicate=True),
-    "gt": Facts(np.greater, arity=2, is_predicate=True),
-    "ge": Facts(np.greater_equal, arity=2, is_predicate=True),
+    "add": Facts(np.add, commutes=True),
+    "mul": Facts(np.multiply, commutes=True),
+    "max": Facts(np.maximum, commutes=True),
+    "min": Facts(np.minimum, commutes=True),
+    "and": Facts(np.bitwise_and, in_jax="bitwise_and", commutes=True),
+    "or": Facts(np.bitwise_or, in_jax="bitwise_or", commutes=True),
+    "xor": Facts(np.bitwise_xor, in_jax="bitwise_xor", commutes=True),
+    "eq": Facts(np.equal, is_predicate=True),
+    "ne": Facts(np.not_equal, is_predicate=True),
+    "lt": Facts(np.less, is_predicate=True),
+    "le": Facts(np.less_equal, is_predicate=True),
+    "gt": Facts(np.greater, is_predicate=True),
+    "ge": Facts(np.greater_equal, is_predicate=True),
     "is_finite": Facts(np.isfinite, is_predicate=True),
-    "select_n": Facts(arity=3),
-    "sub": Facts(np.subtract, arity=2),
-    "div": Facts(arity=2),
-    "rem": Facts(arity=2),
-    "pow": Facts(np.power, arity=2),
-    "atan2": Facts(np.arctan2, arity=2),
-    "nextafter": Facts(np.nextafter, arity=2),
-    "shift_left": Facts(np.left_shift, arity=2),
+    "sub": Facts(np.subtract),
+    "pow": Facts(np.power),
+    "atan2": Facts(np.arctan2),
+    "nextafter": Facts(np.nextafter),
+    "shift_left": Facts(np.left_shift),
     "neg": Facts(np.negative),
     "not": Facts(np.invert, in_jax="bitwise_not"),
     **_named("abs", "sign", "floor", "ceil", "sqrt", "cbrt", "exp", "exp2", "expm1"),
     **_named("log", "log1p", "sin", "cos", "tan", "sinh", "cosh", "tanh"),
     **{f"a{name}": Facts(getattr(np, f"arc{name}")) for name in ("sin", "cos", "tan")},
     **{f"a{name}": Facts(getattr(np, f"arc{name}")) for name in ("sinh", "cosh", "tanh")},
-    **dict.fromkeys(("rsqrt", "logistic"), Facts()),
+    **dict.fromkeys(("select_n", "div", "rem", "rsqrt", "logistic"), Facts()),
     **dict.fromkeys(("erf", "erf_inv", "erfc", "round"), Facts(has_params=True)),
     **dict.fromkeys(("clz", "population_count", "reduce_precision"), Facts(has_params=True)),
     **dict.fromkeys(("convert_element_type", "bitcast_convert_type"), Facts(has_params=True)),
-    "shift_right_arithmetic": Facts(arity=2, has_params=True),
-    "shift_right_logical": Facts(arity=2, has_params=True),
+    **dict.fromkeys(("shift_right_arithmetic", "shift_right_logical"), Facts(has_params=True)),
 }
 
 
@@ -111,14 +105,14 @@ class Scope:
 
     depth: 0 for the program itself.
     floor: nodes made here are placed in a scope at least this deep.
-    known: the nodes of this scope by what they compute.
+    nodes: the nodes of this scope by what they compute.
     cost: the number of nodes placed here.
     has_loop: whether a loop was made here.
     """
 
     depth: int
     floor: int
-    known: dict[Hashable, "Node"] = dataclasses.field(default_factory=dict)
+    nodes: dict[Hashable, "Node"] = dataclasses.field(default_factory=dict)
     cost: int = 0
     has_loop: bool = False
 
@@ -227,11 +221,17 @@ class Loop:
 
         A carry that every iteration sets to the same is that, and not what the loop ends with.
         """
-        certain = self.active is None and bool(self.length)  # that an iteration runs
+        runs_at_least_once = self.active is None and bool(self.length)
         carry = []
         for init, following, out in zip(self.inits, self.nexts, self.outs, strict=True):
-            inside = isinstance(following, Node) and following.scope is self.body
-            carry.append(init if out is None else out if inside or not certain else following)
+            is_inside = isinstance(following, Node) and following.scope is self.body
+            if out is None:
+                carry.append(init)
+            elif is_inside or not runs_at_least_once:
+                carry.append(out)
+            else:
+                carry.append(following)
+        # What every iteration adds alike has no leaves: it is the same scalar each time.
         ys = [
             stacked or [y] * (self.length or 0)
             for y, stacked in zip(self.ys, self.stacked, strict=True)
@@ -251,6 +251,6 @@ def identity(scalar: Scalar) -> tuple:
     return (1, scalar.tobytes(), scalar.dtype.str)
 
 
-def same(left: Scalar, right: Scalar) -> bool:
+def same(x: Scalar, y: Scalar) -> bool:
     """Returns whether two scalars are the same node or bitwise the same constant."""
-    return left is right or identity(left) == identity(right)
+    return x is y or identity(x) == identity(y)

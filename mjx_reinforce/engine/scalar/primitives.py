@@ -1,12 +1,65 @@
-"""What a function says to be written out as: ``skippable``, ``whole``, ``any_lane``.
+"""The three ways of tracing a function, and what a function says to be written out as.
 
-Where one episode is best computed in another way than many, a function asks ``is_written_out``
-while it is traced: whoever writes it out traces it within ``writing_out``.
+An environment, its physics and its policy are written once, as JAX. They are traced in one of three
+ways, and where one is best computed otherwise than another, the function asks which one it is. The
+way is part of the context, not an argument: MJX and flax stand between the one who sets it and the
+one who asks. JAX keeps what it traced in one way apart from what it traced in another.
 
-``skippable`` is a computation that changes nothing where it is not needed. ``scalar`` writes it out
-as a branch that is skipped if no lane needs it. Of ``jax.lax.cond`` it also selects each lane's own
-result, which costs an operation for each number; a skippable computation gives the same where a
-lane does not need it.
+==============  ======================================================================
+way             who sets it, and what becomes of the program
+==============  ======================================================================
+for XLA         Nobody: the default. ``jax.vmap`` maps the function over episodes, and
+                XLA compiles passes over arrays.
+written out     ``writing_out``, in ``scalarized.trace``: for machine code on CPUs, for
+                threads of GPUs, and for ``scalar.vmap``. Arrays become scalars; loops
+                and branches stay. ``unrolled`` is 1 on CPUs and 25 on GPUs, where what
+                a loop reads is in memory. ``physics/touching.py`` sets it to 1 again
+                around code that rarely runs or would be long.
+kept whole      ``base.keeping_whole``, in ``play/program.py`` around
+                ``scalarized.trace``: for teams of lanes. The program is written out,
+                but physics and layers of the policy are single operations, which the
+                C++ of ``team`` knows. ``base.shapes`` sets it too, so that asking for
+                shapes does not trace the physics.
+==============  ======================================================================
+
+Who asks, and why:
+
+====================================  =============================================================
+``is_written_out``
+====================================  =============================================================
+``play/units.py``                     the policy: a loop over units is short, a product of matrices
+                                      would be thousands of scalars
+``physics/contacts.py``               geoms collide pair by pair, and pairs that are apart are
+                                      skipped; XLA takes all at once. And a search stays a loop
+``physics/rows.py``                   rows contact by contact, skipped where nothing touches
+``physics/contact_rows.py``           products with the Jacobian by contacts, skipped likewise; XLA
+                                      multiplies whole matrices
+``physics/touching.py``               contacts that touch are packed, so that loops are short
+``physics/early_stop.py``             rows one after the other: in one block LLVM takes minutes
+``physics/inertia.py``                elimination from the leaves of the tree of bodies, whose zeros
+                                      fold away; XLA takes MJX's own
+``skippable``                         XLA has ``jax.lax.cond`` instead
+====================================  =============================================================
+
+====================================  =============================================================
+``base.is_kept_whole``
+====================================  =============================================================
+``envs/base.py``                      whether ``whole`` stands for the steps of the physics
+``play/units.py``                     whether ``whole`` stands for a layer of the network
+====================================  =============================================================
+
+What a function may say, in any of the ways:
+
+- ``short_scan`` is a loop that is written out up to the length ``unrolled``. The physics uses it
+  for contacts and rows.
+- ``skippable`` is a computation that changes nothing where it is not needed. It is written out as a
+  branch that is skipped if no lane needs it. Of ``jax.lax.cond`` each lane's own result is also
+  selected, which costs an operation for each number; a skippable computation gives the same where a
+  lane does not need it. ``physics/contact_rows.py`` and ``physics/newton.py`` add contacts so.
+- ``whole`` calls an operation that a backend knows by its name, only where it is kept whole.
+- ``any_lane`` is for XLA alone: a predicate that stays one bool under ``jax.vmap``. ``vmap`` uses
+  it for loops and branches, ``episode.while_any`` and ``training/wrappers.py`` to end early over
+  seeds.
 """
 
 import functools
@@ -47,6 +100,7 @@ def is_written_out() -> bool:
 def short_scan(step: Callable, init: PyTree, xs: PyTree) -> Any:
     """``lax.scan`` of what is written out; up to a length that the engine chooses, no loop is."""
     length = len(jax.tree.leaves(xs)[0])
+    # The rule of ``scan`` writes out what is to be unrolled wholly, whatever its own limit is.
     return jax.lax.scan(step, init, xs, unroll=length <= (_UNROLLED.value or 0))
 
 
@@ -67,6 +121,8 @@ def skippable(needed: jax.Array, compute: Callable[[], PyTree], otherwise: PyTre
     if not is_written_out():
         return jax.lax.cond(needed, compute, lambda: otherwise)
     leaves, tree = jax.tree.flatten(otherwise)
+    # What the computation reads of the trace around it becomes operands: a primitive's parameters
+    # must not hold values of a trace.
     program, _ = jaxprs.trace(lambda: jax.tree.leaves(compute()))
     computation = jax.make_jaxpr(lambda *xs: jax.core.eval_jaxpr(program.jaxpr, xs))(
         *program.consts
@@ -78,17 +134,20 @@ def skippable(needed: jax.Array, compute: Callable[[], PyTree], otherwise: PyTre
 
 
 def _plain_skippable(needed: Any, *operands: Any, computation: Any, num_results: int) -> list[Any]:
-    otherwise, consts = list(operands[:num_results]), operands[num_results:]
+    otherwise = list(operands[:num_results])
+    consts = operands[num_results:]
     return jax.lax.cond(needed, lambda: core.jaxpr_as_fun(computation)(*consts), lambda: otherwise)
 
 
 def _batched_skippable(operands: Sequence[Any], axes: Sequence[int | None], **params: Any) -> tuple:
+    # Mapped, one example may need it where another does not: as a ``cond`` it becomes a selection.
     results = jax.vmap(functools.partial(_plain_skippable, **params), tuple(axes))(*operands)
     return results, [0] * len(results)
 
 
 def _derivative_of_skippable(primals: Any, tangents: Any, **params: Any) -> tuple:
     plain = functools.partial(_plain_skippable, **params)
+    # ``jvp`` takes no symbolic zeros, which stand for operands that nothing is differentiated by.
     return jax.jvp(plain, tuple(primals), tuple(map(ad.instantiate_zeros, tangents)))
 
 
@@ -117,8 +176,8 @@ def whole(
       owner: whose operation it is, as ``hex(id(env))``; "" if it is everybody's.
     """
     facts = tuple((field, x.shape, np.dtype(x.dtype)) for field, x in results.items())
-    made = _WHOLE.bind(*args, name=name, results=facts, owner=owner)
-    return dict(zip(results, made, strict=True))
+    arrays = _WHOLE.bind(*args, name=name, results=facts, owner=owner)
+    return dict(zip(results, arrays, strict=True))
 
 
 def owners(traced: jaxprs.Program) -> Iterator[str]:
@@ -149,4 +208,5 @@ def any_lane(predicate: jax.Array) -> jax.Array:
 @any_lane.def_vmap
 def _reduce_outer_axis(axis_size: int, in_batched: list[bool], predicate: jax.Array) -> Any:
     del axis_size, in_batched
+    # The array with its new axis is reduced as a whole, so the result is the same for all examples.
     return any_lane(predicate), False

@@ -108,21 +108,26 @@ def build(
     """
     if any(is_key(variable.aval) for variable in program.jaxpr.invars):
         raise jaxprs.no_keys()
+    # Before anything is written, which takes seconds to minutes.
     size.check_size(program, entries)
     graph = Graph(branch_cost, scans)
-    varying = [True] * len(program.jaxpr.invars) if varying is None else varying
-    given = [variable.aval for variable in program.jaxpr.invars]
+    in_avals = [variable.aval for variable in program.jaxpr.invars]
+    if varying is None:
+        varying = [True] * len(in_avals)
+    # Constants that an outer transformation traces are further inputs, of which all lanes have the
+    # same.
     captured = [*filter(jaxprs.is_traced, program.consts)]
-    facts = [*zip(given, varying, strict=True), *((jax.typeof(x), False) for x in captured)]
-    inputs = [_input_array(graph, k, *each) for k, each in enumerate(facts)]
-    read = dict(zip(map(id, captured), inputs[len(given) :], strict=True))
-    program = program._replace(consts=[read.get(id(x), x) for x in program.consts])
+    facts = [*zip(in_avals, varying, strict=True), *((jax.typeof(x), False) for x in captured)]
+    inputs = [_input_array(graph, k, aval, varies) for k, (aval, varies) in enumerate(facts)]
+    captured_inputs = dict(zip(map(id, captured), inputs[len(in_avals) :], strict=True))
+    program = program._replace(consts=[captured_inputs.get(id(x), x) for x in program.consts])
+    # Folding may divide by zero in a branch that no lane takes.
     with np.errstate(all="ignore"):
-        results = run(graph, program, inputs[: len(given)])
-    outputs = [arrays.elements(result) for result in results]
+        results = run(graph, program, inputs[: len(in_avals)])
+    outputs = [arrays.elements(array) for array in results]
     out_avals, out_tree = jax.tree.flatten(out_shape)
     return Scalarized(
-        in_avals=given,
+        in_avals=in_avals,
         out_tree=out_tree,
         out_avals=out_avals,
         outputs=outputs,
@@ -141,7 +146,7 @@ def run(
     graph: Graph,
     program: jaxprs.Program,
     args: list[np.ndarray],
-    used: list[bool] | None = None,
+    live: list[bool] | None = None,
 ) -> list[np.ndarray]:
     """Returns a program's outputs.
 
@@ -149,10 +154,12 @@ def run(
       graph: where nodes are made.
       program: what is evaluated.
       args: its arguments.
-      used: which of its outputs are; others are zeros, and nothing is computed for them.
+      live: which of its outputs something reads; others are zeros, and nothing is computed for
+        them.
     """
     jaxpr = program.jaxpr
-    used = [True] * len(jaxpr.outvars) if used is None else used
+    if live is None:
+        live = [True] * len(jaxpr.outvars)
     values = dict(zip(jaxpr.invars, args, strict=True))
     for variable, const in zip(jaxpr.constvars, program.consts, strict=True):
         values[variable] = jaxprs.as_numpy(const)
@@ -160,32 +167,33 @@ def run(
     def read(atom: Any) -> np.ndarray:
         return jaxprs.literal_value(atom) if jaxprs.is_literal(atom) else values[atom]
 
-    for eqn, needed in jaxprs.live_equations(jaxpr, used):
-        results = _apply(graph, eqn, needed, [read(atom) for atom in eqn.invars])
+    for eqn, live_results in jaxprs.live_equations(jaxpr, live):
+        results = _apply(graph, eqn, live_results, [read(atom) for atom in eqn.invars])
         values.update(zip(eqn.outvars, results, strict=True))
     return [
-        read(out) if use else arrays.zeros(out.aval)
-        for out, use in zip(jaxpr.outvars, used, strict=True)
+        read(out) if is_live else arrays.zeros(out.aval)
+        for out, is_live in zip(jaxpr.outvars, live, strict=True)
     ]
 
 
 def _apply(
-    graph: Graph, eqn: jaxprs.Equation, used: list[bool], operands: list[np.ndarray]
+    graph: Graph, eqn: jaxprs.Equation, live: list[bool], operands: list[np.ndarray]
 ) -> list:
     """Applies the rule of one equation; what has no rule may call a program that can be run."""
     name = eqn.primitive.name
     if name in _CONTROL:
         with graph.evaluating(eqn):
-            return _CONTROL[name](graph, functools.partial(run, graph), eqn, used, *operands)
+            return _CONTROL[name](graph, functools.partial(run, graph), eqn, live, *operands)
     if name in _ARRAY_RULES:
         if name not in _KEYS_TO_WORDS and any(is_key(atom.aval) for atom in eqn.invars):
             return _word_by_word(graph, eqn, operands)
         results = zip(_ARRAY_RULES[name](graph, eqn, *operands), eqn.outvars, strict=True)
-        return [arrays.settle(result, out.aval.dtype) for result, out in results]
+        return [arrays.settle(array, out.aval.dtype) for array, out in results]
     program = jaxprs.callee(eqn)
     if program is not None:
         with graph.evaluating(eqn):
-            return run(graph, program, operands, used)
+            return run(graph, program, operands, live)
+    # JAX computes what is left of constants. Keys it would return as keys, not as their words.
     makes_keys = any(is_key(out.aval) for out in eqn.outvars)
     if all(map(arrays.is_numeric, operands)) and not makes_keys:
         return jaxprs.compute_constants(eqn.primitive.bind, eqn.params, operands)
@@ -194,10 +202,14 @@ def _apply(
 
 def _word_by_word(graph: Graph, eqn: jaxprs.Equation, operands: list[np.ndarray]) -> list:
     """Applies a rule that moves keys, whose words are their arrays' last axis."""
-    keys = [is_key(atom.aval) for atom in eqn.invars]
-    rule, one = _ARRAY_RULES[eqn.primitive.name], jaxprs.on_words(eqn)
+    are_keys = [is_key(atom.aval) for atom in eqn.invars]
+    rule = _ARRAY_RULES[eqn.primitive.name]
+    word_eqn = jaxprs.on_words(eqn)
     planes = []
-    for k in range(operands[keys.index(True)].shape[-1]):
-        plane = [x[..., k] if key else x for x, key in zip(operands, keys, strict=True)]
-        planes.append(rule(graph, one, *plane))
+    for k in range(operands[are_keys.index(True)].shape[-1]):
+        # The k-th word of each key; indices and such are the same for all words.
+        plane = [
+            x[..., k] if has_words else x for x, has_words in zip(operands, are_keys, strict=True)
+        ]
+        planes.append(rule(graph, word_eqn, *plane))
     return [np.stack(arrays.together(words), -1) for words in zip(*planes, strict=True)]

@@ -33,7 +33,8 @@ def check_size(program: jaxprs.Program, entries: int = 0) -> None:
       program: what is written out.
       entries: of an observation.
     """
-    step, pairs = num_scalars(program), _PER_PAIR * entries**2
+    step = num_scalars(program)
+    pairs = _PER_PAIR * entries**2
     if step + pairs > MAX_SCALARS:
         remedy = f"let it observe fewer than {entries:,} numbers"
         if step > pairs:
@@ -46,22 +47,33 @@ def check_size(program: jaxprs.Program, entries: int = 0) -> None:
 
 def num_scalars(program: jaxprs.Program) -> int:
     """Returns about how many scalar operations are written, those that fold away included."""
-    default = {
+    # ``platform_dependent`` is a ``cond`` over such a number, of which one branch is written.
+    defaults = {
         eqn.outvars[0]: jaxprs.default_platform(eqn)
         for eqn in program.jaxpr.eqns
         if eqn.primitive.name == "platform_index"
     }
-    return sum(_equation_size(eqn, default) for eqn in program.jaxpr.eqns)
+    return sum(_equation_size(eqn, defaults) for eqn in program.jaxpr.eqns)
 
 
-def _equation_size(eqn: Any, default: Mapping[Any, int | None]) -> int:
-    """Returns the size of one equation."""
-    name, params = eqn.primitive.name, eqn.params
+def _equation_size(eqn: Any, defaults: Mapping[Any, int | None]) -> int:
+    """Returns the size of one equation.
+
+    Args:
+      eqn: the equation.
+      defaults: for each number that ``platform_index`` returns, the default branch.
+    """
+    name = eqn.primitive.name
+    params = eqn.params
     if name == "cond":
         sizes = [num_scalars(jaxprs.program(branch)) for branch in params["branches"]]
         index = eqn.invars[0]
-        known = None if jaxprs.is_literal(index) else default.get(index)
-        return sum(sizes) if known is None else sizes[known]
+        default = None
+        if not jaxprs.is_literal(index):
+            default = defaults.get(index)
+        if default is None:
+            return sum(sizes)
+        return sizes[default]
     if name == "skippable":
         return num_scalars(jaxprs.program(params["computation"]))
     if name == "while":
@@ -70,18 +82,24 @@ def _equation_size(eqn: Any, default: Mapping[Any, int | None]) -> int:
     if name == "scan":
         body = min(_LOOP, params["length"]) * num_scalars(jaxprs.program(params["jaxpr"]))
         return body + _entries(eqn.invars) + _entries(eqn.outvars)
-    made, read = _entries(eqn.outvars), _entries(eqn.invars)
+    num_results = _entries(eqn.outvars)
     if name == "dot_general":
         (contracted, _), _ = params["dimension_numbers"]
-        return 2 * made * math.prod(eqn.invars[0].aval.shape[axis] for axis in contracted)
+        # A product and a sum for each pair of contracted entries.
+        return 2 * num_results * math.prod(eqn.invars[0].aval.shape[axis] for axis in contracted)
     if name in ("cholesky", "triangular_solve"):
-        return made * eqn.invars[0].aval.shape[-1]
+        # An entry of the result is a sum over a row that is half full on average: n products and
+        # sums.
+        return num_results * eqn.invars[0].aval.shape[-1]
     if name in _ELEMENTWISE:
-        return made
+        return num_results
     if name.startswith(("reduce_", "cum", "arg")):
-        return read
+        return _entries(eqn.invars)
+    # Others move elements about, which costs nothing, or call a program.
     program = jaxprs.callee(eqn)
-    return 0 if program is None else num_scalars(program)
+    if program is None:
+        return 0
+    return num_scalars(program)
 
 
 def _entries(atoms: Any) -> int:

@@ -51,10 +51,11 @@ def vmap(
       TooLarge: if fn is more than is written out.
       UnsupportedPrimitive: if fn uses a primitive that has no rule, or reads typed PRNG keys.
     """
-    one = jax.custom_batching.custom_vmap(lambda *args: fn(*args))
+    example_fn = jax.custom_batching.custom_vmap(lambda *args: fn(*args))
 
-    @one.def_vmap
+    @example_fn.def_vmap
     def _(batch, mapped, *args):
+        """Returns the results of a batch, and that the batch is the first axis of each."""
         varying = jax.tree.leaves(mapped)
         leaves, tree = jax.tree.flatten(args)
         examples = [
@@ -65,7 +66,7 @@ def vmap(
         written = scalarized.build(*traced, branch_cost, varying=varying)
         return evaluate(written, leaves, varying), jax.tree.map(lambda _: True, traced[1])
 
-    return functools.wraps(fn)(jax.vmap(one, in_axes, out_axes))
+    return functools.wraps(fn)(jax.vmap(example_fn, in_axes, out_axes))
 
 
 def evaluate(written: scalarized.Scalarized, leaves: Sequence[Any], varying: Sequence[bool]) -> Any:
@@ -84,6 +85,7 @@ def evaluate(written: scalarized.Scalarized, leaves: Sequence[Any], varying: Seq
             stacklevel=2,
         )
     batch = leaves[list(varying).index(True)].shape[0]
+    # [entries, N] of an argument that varies, so that a scalar's lane is a contiguous row.
     rows = [
         jnp.moveaxis(x, 0, -1).reshape(-1, batch) if varies else jnp.reshape(x, -1)
         for x, varies in zip(leaves, varying, strict=True)
@@ -97,6 +99,7 @@ def evaluate(written: scalarized.Scalarized, leaves: Sequence[Any], varying: Seq
     values = written.compile(XLA(read, (batch,)))
     for scalars, aval in zip(values, written.out_avals, strict=True):
         lanes = [x if np.ndim(x) else lax.broadcast(x, (batch,)) for x in scalars]
+        # [entries, N] here, and the batch comes first in the result, as ``jax.vmap`` wants it.
         stacked = jnp.stack(lanes) if lanes else jnp.zeros((0, batch), aval.dtype)
         outputs.append(jnp.moveaxis(stacked.reshape((*aval.shape, batch)), -1, 0))
     return jax.tree.unflatten(written.out_tree, outputs)
@@ -139,8 +142,10 @@ class XLA(Backend[Any]):
     def gate(self, gate: LiveGate, values: Values) -> Sequence[Any]:
         """Emits a ``cond``."""
         predicate = self._any_of(self.value(gate.predicate, values))
-        before = dict(values)
-        cold = [self._materialize(out.cold, out.leaf.varying, before) for out in gate.outs]
+        # Reading a leaf adds it to the values. With a copy, the branch reads its own and captures
+        # none of these.
+        outside = dict(values)
+        cold = [self._materialize(out.cold, out.leaf.varying, outside) for out in gate.outs]
 
         def hot() -> list[Any]:
             inner = self.inside(gate.body, values)
@@ -152,23 +157,25 @@ class XLA(Backend[Any]):
         """Emits a ``fori_loop``, a ``scan`` or a ``while_loop``."""
         init = [self._materialize(c.init, c.out.varying, values) for c in loop.carries]
         body = functools.partial(self._iteration, loop, values)
+        # Only ``scan`` reads a row and keeps a record in each iteration; such a loop has a length
+        # and never ends early.
         if loop.records or loop.elements:
             rows = [
                 jax.numpy.stack([self._materialize(x, e.leaf.varying, values) for x in e.values])
                 for e in loop.elements
             ]
             final, stacked = lax.scan(body, init, rows, length=loop.length)
-            each = zip(loop.records, stacked, strict=True)
-            return [*final, *(kept[t] for x, kept in each for t in range(len(x.outs)))]
+            records = zip(loop.records, stacked, strict=True)
+            return [*final, *(row[t] for record, row in records for t in range(len(record.outs)))]
         return self._repeat(loop, body, init)
 
     def _iteration(
         self, loop: LiveLoop, values: Values, carry: list[Any], row: Sequence[Any] = ()
     ) -> tuple[list[Any], list[Any]]:
         """Emits a loop's body; returns the next carry and what is kept."""
-        known = dict(zip((c.leaf for c in loop.carries), carry, strict=True))
-        known.update(zip((e.leaf for e in loop.elements), row, strict=True))
-        inner = self.inside(loop.body, values, known)
+        leaves = dict(zip((c.leaf for c in loop.carries), carry, strict=True))
+        leaves.update(zip((e.leaf for e in loop.elements), row, strict=True))
+        inner = self.inside(loop.body, values, leaves)
         nexts = [self._materialize(c.next, c.out.varying, inner) for c in loop.carries]
         return nexts, [self.value(record.value, inner) for record in loop.records]
 
@@ -192,7 +199,9 @@ class XLA(Backend[Any]):
 
     def _any_of(self, predicate: Any) -> Any:
         """Returns whether a predicate holds in any lane; one that all lanes share is the answer."""
-        return any_lane(predicate) if np.ndim(predicate) else predicate
+        if np.ndim(predicate) == 0:
+            return predicate
+        return any_lane(predicate)
 
     def _spread(self, value: Any, varying: bool) -> Any:
         """Gives a constant or a shared value the shape of a lane."""

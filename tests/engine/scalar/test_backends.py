@@ -29,6 +29,12 @@ ON_BITS = {
     *("and", "or", "xor", "not", "shift_left", "shift_right_arithmetic", "shift_right_logical"),
     *("clz", "population_count"),
 }
+#: What takes two operands; a selection takes three, all others one.
+BINARY = {
+    *("add", "sub", "mul", "div", "rem", "pow", "atan2", "nextafter", "max", "min"),
+    *("and", "or", "xor", "shift_left", "shift_right_arithmetic", "shift_right_logical"),
+    *("eq", "ne", "lt", "le", "gt", "ge"),
+}
 PARAMS = {
     "convert_element_type": {"new_dtype": np.dtype(np.int32)},
     "bitcast_convert_type": {"new_dtype": np.dtype(np.int32)},
@@ -39,9 +45,9 @@ PARAMS = {
 
 def operands_of(name):
     values = BITS if name in ON_BITS else FLOATS
-    operands = list(values[: FACTS[name].arity])
+    operands = list(values[: 2 if name in BINARY else 1])
     if name == "select_n":
-        operands[0] = np.True_
+        operands = [np.True_, *values[1:]]
     if name == "acosh":
         operands = [np.float32(1.5)]
     return operands

@@ -122,12 +122,16 @@ def evenly_spaced(places: Sequence[tuple[Any, int] | None]) -> tuple[Any, int, i
     Args:
       places: the array of each and where it is in it; None for what is in none.
     """
-    first, second = places[0], places[min(1, len(places) - 1)]
-    if first is None or second is None:
+    place = places[0]
+    next_place = places[min(1, len(places) - 1)]
+    if place is None or next_place is None:
         return None
-    (array, start), stride = first, second[1] - first[1]
-    spaced = all(x == (array, start + k * stride) for k, x in enumerate(places))
-    return (array, start, stride) if spaced else None
+    array, start = place
+    # A single entry is its own next, with a stride of 0.
+    stride = next_place[1] - start
+    if any(x != (array, start + k * stride) for k, x in enumerate(places)):
+        return None
+    return array, start, stride
 
 
 def nodes(body: Schedule) -> Iterator[Node]:
@@ -142,7 +146,10 @@ def calls(body: Schedule) -> Iterator[Call]:
 
 def _flat(body: Schedule) -> Iterator[Node | Call]:
     for step in body:
-        yield from [step] if isinstance(step, Node | Call) else _flat(step.body)
+        if isinstance(step, Node | Call):
+            yield step
+        else:
+            yield from _flat(step.body)
 
 
 def schedule(root: Scope, results: Iterable[Scalar]) -> Schedule:
@@ -153,11 +160,13 @@ def schedule(root: Scope, results: Iterable[Scalar]) -> Schedule:
       results: scalars of that scope.
     """
     needs = _Needs()
-    waiting, seen = list(results), set()
+    # A list and no recursion: chains of operands are longer than Python's stack.
+    waiting = list(results)
+    noted = set()
     while waiting:
         node = waiting.pop()
-        if isinstance(node, Node) and node not in seen:
-            seen.add(node)
+        if isinstance(node, Node) and node not in noted:
+            noted.add(node)
             waiting.extend(needs.note(node))
     return needs.steps_of(root)
 
@@ -179,6 +188,7 @@ class _Needs:
             return list(node.args)
         if isinstance(owner, Gate):
             self._steps[owner.scope].add(owner)
+            # Only this result: what others need of the branch is noted when something reads them.
             self._outs[owner].add(node.position)
             return [owner.predicate, owner.hot[node.position], owner.cold[node.position]]
         if isinstance(owner, Call):
@@ -190,19 +200,25 @@ class _Needs:
         return []
 
     def _note_loop(self, loop: Loop, position: tuple) -> list[Scalar]:
+        """Notes that a leaf of a loop is needed; returns what it needs in turn.
+
+        Args:
+          loop: whose leaf it is.
+          position: the leaf's role in the loop, its place among those of the role, and more.
+        """
         role, i = position[:2]
         if role == "element":
-            self._places[loop]["element"].add(i)
             needs = list(loop.xs[i])
         elif role == "y":
-            self._places[loop]["y"].add(i)
             needs = [loop.ys[i]]
-        elif role == "out" and loop.length and loop.active is None:  # of an iteration that runs
-            self._places[loop]["out"].add(i)
+        elif role == "out" and loop.length and loop.active is None:
+            # At least one iteration runs and sets it, so nothing reads the init.
             needs = [loop.nexts[i]]
         else:
-            self._places[loop]["carry"].add(i)
+            # After a loop that may not run at all, the carry is its init.
+            role = "carry"
             needs = [loop.inits[i], loop.nexts[i]]
+        self._places[loop][role].add(i)
         if loop.active is not None:
             needs.append(loop.carries[loop.active])
         return needs
@@ -210,6 +226,7 @@ class _Needs:
     def steps_of(self, scope: Scope) -> Schedule:
         """Returns the steps of a scope in order."""
         steps: Schedule = []
+        # Steps are numbered as they are made, so what a step reads has a lower number.
         for step in sorted(self._steps[scope], key=lambda step: step.index):
             if isinstance(step, Gate):
                 steps.append(self._gate(step))
@@ -220,6 +237,7 @@ class _Needs:
         return steps
 
     def _gate(self, gate: Gate) -> LiveGate:
+        """Returns a gate with those of its results that are needed."""
         outs = [
             Out(leaf, gate.hot[i], gate.cold[i])
             for i in sorted(self._outs[gate])
@@ -228,21 +246,26 @@ class _Needs:
         return LiveGate(gate.predicate, self.steps_of(gate.body), outs)
 
     def _loop(self, loop: Loop) -> LiveLoop:
-        places = {role: sorted(found) for role, found in self._places[loop].items()}
+        """Returns a loop with what is needed of its carry, its elements and its ys."""
+        places = {role: sorted(numbers) for role, numbers in self._places[loop].items()}
         read = set(places.get("carry", ()))
         carried = sorted(read.union(places.get("out", ())))
-        carries = [
-            Carry(leaf, loop.inits[i] if i in read else leaf.dtype.type(0), loop.nexts[i], out)
-            for i in carried
-            if (leaf := loop.carries[i]) is not None and (out := loop.outs[i]) is not None
-        ]
+        carries = []
+        for i in carried:
+            leaf = loop.carries[i]
+            out = loop.outs[i]
+            if leaf is not None and out is not None:
+                init = loop.inits[i] if i in read else leaf.dtype.type(0)
+                carries.append(Carry(leaf, init, loop.nexts[i], out))
         elements = [
             Element(leaf, loop.xs[j])
             for j in places.get("element", [])
             if (leaf := loop.elements[j]) is not None
         ]
         records = [Record(loop.ys[j], loop.stacked[j]) for j in places.get("y", [])]
-        active = None if loop.active is None else carried.index(loop.active)
+        active = None
+        if loop.active is not None:
+            active = carried.index(loop.active)
         return LiveLoop(loop.length, active, self.steps_of(loop.body), carries, elements, records)
 
 
@@ -263,25 +286,31 @@ def accumulators(loop: LiveLoop) -> dict[Node, Carry]:
     else in the body does. What is selected is left out: LLVM makes stores with masks of it, which
     processors by AMD execute lane by lane.
     """
-    read = reads(loop.body, _ends(loop))
+    num_reads = reads(loop.body, _ends(loop))
     carries = {carry.next: carry for carry in loop.carries if isinstance(carry.next, Node)}
-    found = {}
+    in_place = {}
     for gate in loop.body:
-        if isinstance(gate, LiveGate):
-            known, last, times = _read_by_nodes(gate.body)
-            for out in gate.outs:
-                carry = carries.get(out.leaf)
-                if (
-                    carry is not None
-                    and out.cold is carry.leaf
-                    and read[out.leaf] == 1
-                    and read[carry.leaf] == times[carry.leaf] + 1  # and as what stays if skipped
-                    and last.get(carry.leaf, -1) <= known.get(out.hot, -1)
-                    and out.hot not in found
-                    and out.hot.op != SELECT
-                ):
-                    found[out.hot] = carry
-    return found
+        if not isinstance(gate, LiveGate):
+            continue
+        branch = _read_by_nodes(gate.body)
+        for out in gate.outs:
+            carry = carries.get(out.leaf)
+            if carry is None or out.cold is not carry.leaf:
+                continue
+            # The nodes of the branch are the only ones that read it; the gate itself names it once
+            # more, as what stays where the branch is skipped.
+            only_here = num_reads[carry.leaf] == branch.num_reads[carry.leaf] + 1
+            # The new value is stored as soon as it is known: no node may read the old one after it.
+            in_time = branch.last_read.get(carry.leaf, -1) <= branch.places.get(out.hot, -1)
+            if (
+                num_reads[out.leaf] == 1
+                and only_here
+                and in_time
+                and out.hot not in in_place
+                and out.hot.op != SELECT
+            ):
+                in_place[out.hot] = carry
+    return in_place
 
 
 def _ends(loop: LiveLoop) -> list[Scalar]:
@@ -289,11 +318,24 @@ def _ends(loop: LiveLoop) -> list[Scalar]:
     return [*(carry.next for carry in loop.carries), *(record.value for record in loop.records)]
 
 
-def _read_by_nodes(body: Schedule) -> tuple[dict[Scalar, int], dict[Scalar, int], Counter[Node]]:
-    """Returns where each node is, where a node reads each scalar last, and how often nodes do."""
-    nodes = {step: k for k, step in enumerate(body) if isinstance(step, Node)}
-    last = {arg: k for step, k in nodes.items() for arg in _nodes(step.args)}
-    return nodes, last, Counter(arg for step in nodes for arg in _nodes(step.args))
+class _NodeReads(NamedTuple):
+    """What the nodes of a schedule read, but not those inside of its loops and gates.
+
+    places: where in the schedule each node is.
+    last_read: where a scalar is read last.
+    num_reads: how often.
+    """
+
+    places: dict[Scalar, int]
+    last_read: dict[Scalar, int]
+    num_reads: Counter[Node]
+
+
+def _read_by_nodes(body: Schedule) -> _NodeReads:
+    places = {step: k for k, step in enumerate(body) if isinstance(step, Node)}
+    last_read = {arg: k for step, k in places.items() for arg in _nodes(step.args)}
+    num_reads = Counter(arg for step in places for arg in _nodes(step.args))
+    return _NodeReads(places, last_read, num_reads)
 
 
 def _nodes(scalars: Iterable[Scalar]) -> Iterator[Node]:

@@ -45,22 +45,25 @@ def fold(op: Op, operands: Sequence[Any], dtype: np.dtype) -> Any:
     """
     name = op.name
     if name == "convert_element_type":
-        result = np.asarray(operands[0]).astype(dtype)
+        value = np.asarray(operands[0]).astype(dtype)
     elif name == "bitcast_convert_type":
-        result = np.asarray(operands[0]).view(dtype)
+        value = np.asarray(operands[0]).view(dtype)
     elif (by_numpy := _EXCEPTIONS.get(name, FACTS[name].in_numpy)) is not None:
-        result = by_numpy(*operands)
+        value = by_numpy(*operands)
     else:
-        result = jaxprs.compute_constants(jaxprs.operation(name), dict(op.params), operands)[0]
-    return np.asarray(result, dtype)[()]
+        value = jaxprs.compute_constants(jaxprs.operation(name), dict(op.params), operands)[0]
+    # NumPy may compute in a wider dtype than JAX. ``[()]`` makes a scalar of an array of no axes.
+    return np.asarray(value, dtype)[()]
 
 
 def _divide(x: np.ndarray, y: np.ndarray) -> Any:
     """Division as XLA does it: integers round towards zero, and by zero it is -1."""
     if not _are_integers(x):
         return np.true_divide(x, y)
-    ones = ~np.zeros_like(y)  # -1, in an unsigned integer the greatest
-    return np.where(y == 0, ones, (x - _remainder(x, y)) // np.where(y == 0, 1, y))
+    # NumPy rounds towards minus infinity. Less the remainder, which has the sign of x, the division
+    # is exact.
+    minus_1 = ~np.zeros_like(y)  # in an unsigned integer the greatest
+    return np.where(y == 0, minus_1, (x - _remainder(x, y)) // np.where(y == 0, 1, y))
 
 
 def _remainder(x: np.ndarray, y: np.ndarray) -> Any:
@@ -81,8 +84,8 @@ def _choose_case(predicate: np.ndarray, *cases: np.ndarray) -> Any:
 
 def _logistic(x: np.ndarray) -> Any:
     """1 / (1 + exp(-x)) in x's dtype."""
-    one = np.asarray(x).dtype.type(1)
-    return one / (one + np.exp(-x))
+    unit = np.asarray(x).dtype.type(1)
+    return unit / (unit + np.exp(-x))
 
 
 def _rsqrt(x: np.ndarray) -> Any:
@@ -103,8 +106,9 @@ _EXCEPTIONS: dict[str, Callable[..., Any]] = {
 
 def simplify(graph: Builder, op: Op, args: tuple[Scalar, ...], dtype: np.dtype) -> Scalar | None:
     """Returns a simpler scalar equal to op(*args), or None; at least one operand is a node."""
-    rule = _RULES.get(op.name)
-    simpler = rule(graph, *args) if rule else None
+    simpler = None
+    if op.name in _RULES:
+        simpler = _RULES[op.name](graph, *args)
     if simpler is None and op.name != "select_n":
         simpler = _through_select(graph, op, args, dtype)
     return simpler
@@ -112,17 +116,19 @@ def simplify(graph: Builder, op: Op, args: tuple[Scalar, ...], dtype: np.dtype) 
 
 def power(graph: Builder, base: Scalar, exponent: int) -> Scalar:
     """Returns an integer power by repeated multiplication."""
-    one = base.dtype.type(1)
+    unit = base.dtype.type(1)
     if exponent < 0:
-        return graph.call("div", one, power(graph, base, -exponent))
-    result, square = one, base
+        return graph.call("div", unit, power(graph, base, -exponent))
+    # By squaring: the product takes base^(2^k) for each bit k of the exponent that is set.
+    product = unit
+    square = base
     while exponent:
         if exponent & 1:
-            result = graph.call("mul", result, square)
+            product = graph.call("mul", product, square)
         exponent >>= 1
         if exponent:
             square = graph.call("mul", square, square)
-    return result
+    return product
 
 
 def _is(value: Scalar, number: float) -> bool:
@@ -139,19 +145,23 @@ def _args(value: Scalar, name: str) -> tuple[Scalar, ...] | None:
 def _negated(value: Scalar) -> Scalar | None:
     """Returns x where value is -x, else None."""
     operands = _args(value, "neg")
-    return operands[0] if operands else None
+    if operands is None:
+        return None
+    return operands[0]
 
 
 def _add(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
-    for left, right in ((x, y), (y, x)):
-        if _is(right, 0):
-            return left
-        if _negated(right) is not None:
-            return graph.call("sub", left, _negated(right))
+    """Simplifies x + 0 to x, and x + -y to x - y, in either order."""
+    for term, addend in ((x, y), (y, x)):
+        if _is(addend, 0):
+            return term
+        if _negated(addend) is not None:
+            return graph.call("sub", term, _negated(addend))
     return None
 
 
 def _sub(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
+    """Simplifies x - 0 to x, x - x to 0, 0 - y to -y, and x - -y to x + y."""
     if _is(y, 0):
         return x
     if x is y:
@@ -164,18 +174,20 @@ def _sub(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
 
 
 def _mul(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
-    for left, right in ((x, y), (y, x)):
-        if _is(right, 0):
-            return right.dtype.type(0)
-        if _is(right, 1):
-            return left
-        if _is(right, -1) and not np.issubdtype(right.dtype, np.unsignedinteger):
-            return graph.call("neg", left)
-        if _negated(left) is not None:
-            if is_constant(right):
-                return graph.call("mul", _negated(left), -right)
-            return graph.call("neg", graph.call("mul", _negated(left), right))
-        masked = _mask(graph, left, right)
+    """Simplifies products with 0, 1, -1, a bool, or a negated scalar, whose sign moves outwards."""
+    for factor, scale in ((x, y), (y, x)):
+        if _is(scale, 0):
+            return scale.dtype.type(0)
+        if _is(scale, 1):
+            return factor
+        if _is(scale, -1) and not np.issubdtype(scale.dtype, np.unsignedinteger):
+            return graph.call("neg", factor)
+        if _negated(factor) is not None:
+            # A constant takes the sign itself, which saves an operation.
+            if is_constant(scale):
+                return graph.call("mul", _negated(factor), -scale)
+            return graph.call("neg", graph.call("mul", _negated(factor), scale))
+        masked = _mask(graph, factor, scale)
         if masked is not None:
             return masked
     return None
@@ -184,6 +196,7 @@ def _mul(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
 def _mask(graph: Builder, mask: Scalar, value: Scalar) -> Scalar | None:
     """Turns a product with a bool's 1 or 0 into a selection."""
     operands = _args(mask, "select_n")
+    # A product with a constant folds into the two cases of the selection, see ``_through_select``.
     if operands and not is_constant(value):
         predicate, on_false, on_true = operands
         zero = value.dtype.type(0)
@@ -195,13 +208,17 @@ def _mask(graph: Builder, mask: Scalar, value: Scalar) -> Scalar | None:
 
 
 def _div(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
+    """Simplifies 0 / x to 0, x / 1 to x, and a division by a power of 2 to a product."""
     if _is(x, 0) and np.issubdtype(x.dtype, np.floating):  # an integer 0 / 0 is -1
         return x
     if is_constant(y) and np.issubdtype(y.dtype, np.floating):
         mantissa, exponent = np.frexp(y)
+        # The bound keeps reciprocals far from the least normal number of float32, 2^-126.
         if abs(mantissa) == 0.5 and abs(exponent) < 100:
             return graph.call("mul", x, y.dtype.type(1) / y)
-    return x if _is(y, 1) else None
+    if _is(y, 1):
+        return x
+    return None
 
 
 def _pow(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
@@ -211,38 +228,52 @@ def _pow(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
 
 
 def _neg(graph: Builder, x: Scalar) -> Scalar | None:
+    """Simplifies -(-x) to x, and -(x - y) to y - x."""
     if _negated(x) is not None:
         return _negated(x)
     operands = _args(x, "sub")
-    return graph.call("sub", operands[1], operands[0]) if operands else None
+    if operands is None:
+        return None
+    return graph.call("sub", operands[1], operands[0])
 
 
 def _abs(graph: Builder, x: Scalar) -> Scalar | None:
-    return graph.call("abs", _negated(x)) if _negated(x) is not None else None
+    negated = _negated(x)
+    if negated is None:
+        return None
+    return graph.call("abs", negated)
 
 
 def _extreme(x: Scalar, y: Scalar, neutral: float) -> Scalar | None:
+    """Simplifies ``max`` and ``min`` of a scalar and itself, or the number that never wins."""
     if x is y or _is(y, neutral):
         return x
-    return y if _is(x, neutral) else None
+    if _is(x, neutral):
+        return y
+    return None
 
 
 def _bitwise(x: Scalar, y: Scalar, absorbing: bool) -> Scalar | None:
     """Simplifies ``and`` (absorbing False) and ``or`` (absorbing True) of bools."""
     if x.dtype != np.bool_:
         return None
-    for left, right in ((x, y), (y, x)):
-        if is_constant(right):
-            return right if bool(right) is absorbing else left
-    return x if x is y else None
+    for operand, flag in ((x, y), (y, x)):
+        if is_constant(flag):
+            return flag if bool(flag) is absorbing else operand
+    if x is y:
+        return x
+    return None
 
 
 def _not(graph: Builder, x: Scalar) -> Scalar | None:
     operands = _args(x, "not")
-    return operands[0] if operands else None
+    if operands is None:
+        return None
+    return operands[0]
 
 
 def _select(graph: Builder, predicate: Scalar, *cases: Scalar) -> Scalar | None:
+    """Simplifies a selection whose predicate or whose cases decide it."""
     if len(cases) != 2:
         return cases[int(predicate)] if is_constant(predicate) else None
     on_false, on_true = cases
@@ -250,6 +281,7 @@ def _select(graph: Builder, predicate: Scalar, *cases: Scalar) -> Scalar | None:
         return on_true if predicate else on_false
     if same(on_true, on_false):
         return on_true
+    # Without the "not", and with the cases swapped, equal selections are one node.
     inverse = _args(predicate, "not")
     if inverse:
         return graph.select(inverse[0], on_false, on_true)
@@ -263,8 +295,11 @@ def _select(graph: Builder, predicate: Scalar, *cases: Scalar) -> Scalar | None:
 def _select_bool(
     graph: Builder, predicate: Scalar, on_true: Scalar, on_false: Scalar
 ) -> Scalar | None:
+    """Turns a selection among bools, one of them a constant, into "and", "or" and "not"."""
+    if _is(on_true, True) and _is(on_false, False):
+        return predicate
     if _is(on_true, True):
-        return predicate if _is(on_false, False) else graph.call("or", predicate, on_false)
+        return graph.call("or", predicate, on_false)
     if _is(on_false, False):
         return graph.call("and", predicate, on_true)
     if _is(on_true, False):
@@ -293,8 +328,10 @@ def _through_select(
 ) -> Scalar | None:
     """Folds an operation whose operands are constants and selections among constants."""
     nodes = [arg for arg in args if isinstance(arg, Node)]
+    # A bool that becomes a number is a selection of 1 and 0: ``_mask`` finds it in a product.
     if op.name == "convert_element_type" and nodes[0].dtype == np.bool_ and dtype != np.bool_:
         return graph.select(nodes[0], dtype.type(1), dtype.type(0))
+    # All selections must share one predicate: then the operation has two possible results.
     for node in nodes:
         choice = _args(node, "select_n")
         if choice is None or len(choice) != 3 or choice[0] is not nodes[0].args[0]:

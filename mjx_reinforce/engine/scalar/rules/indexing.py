@@ -48,11 +48,13 @@ class Window(NamedTuple):
 def _window(shape: Sequence[int], sizes: Sequence[int], starts: Sequence[Any]) -> Window:
     """Places a window; a constant start is moved to the nearest place inside."""
     strides = [int(np.prod(shape[axis + 1 :], dtype=int)) for axis in range(len(shape))]
+    # Where each entry of the window is in the flat operand, if the window starts at its beginning.
     grids = np.meshgrid(*(np.arange(size) for size in sizes), indexing="ij", copy=False)
     positions = np.zeros(tuple(sizes), int)
     for grid, stride in zip(grids, strides, strict=True):
         positions = positions + grid * stride
-    unknowns, inside = [], True
+    unknowns = []
+    inside = True
     for start, stride, limit, size in zip(starts, strides, shape, sizes, strict=True):
         if isinstance(start, (int, np.integer)):
             nearest = min(max(int(start), 0), limit - size)
@@ -67,10 +69,11 @@ def _read_window(graph: Graph, flat: Array, positions: Array, unknowns: list) ->
     """Reads a window; an unknown start outside counts as the nearest inside."""
     if not unknowns:
         return arrays.lift(flat[positions.reshape(-1)].reshape(positions.shape))
-    (index, stride, count), *rest = unknowns
-    values = _read_window(graph, flat, positions, rest)
+    (index, stride, count), *inner_unknowns = unknowns
+    values = _read_window(graph, flat, positions, inner_unknowns)
+    # A chain of selections: start k replaces start k - 1 where the index is at least k.
     for k in range(1, count):
-        later = _read_window(graph, flat, positions + k * stride, rest)
+        later = _read_window(graph, flat, positions + k * stride, inner_unknowns)
         reached = graph.call("ge", index, index.dtype.type(k))
         select = functools.partial(graph.select, reached)
         values = arrays.map_elements(select, values.shape, object, later, values)
@@ -82,7 +85,9 @@ def _write_window(
 ) -> None:
     """Combines updates into a window, in place; a start outside changes nothing."""
     for ks in itertools.product(*(range(unknown.num_starts) for unknown in window.unknowns)):
-        hit, offset = np.True_, 0
+        # Whether the window starts here, for one place of all that it may have.
+        hit = np.True_
+        offset = 0
         for k, (index, stride, _) in zip(ks, window.unknowns, strict=True):
             hit = graph.call("and", hit, graph.call("eq", index, index.dtype.type(k)))
             offset += k * stride
@@ -99,6 +104,7 @@ def _starts(
         start: list[Any] = [0] * rank
         for k, axis in enumerate(index_dims):
             start[axis] = indices[place][k]
+        # Along a batching axis a window lies where its indices lie along theirs.
         for axis, source in zip(batching_dims, indices_batching_dims, strict=True):
             start[axis] = place[source]
         yield start
@@ -110,8 +116,12 @@ def _outside_mode(eqn: Equation) -> str:
 
 
 def _gather_rule(graph: Graph, eqn: Equation, operand: Array, indices: Array) -> Results:
-    dims, sizes = eqn.params["dimension_numbers"], eqn.params["slice_sizes"]
-    aval, flat = eqn.outvars[0].aval, operand.reshape(-1)
+    """Reads a window for each row of indices, and puts them together."""
+    dims = eqn.params["dimension_numbers"]
+    sizes = eqn.params["slice_sizes"]
+    aval = eqn.outvars[0].aval
+    flat = operand.reshape(-1)
+    # Axes of size 1 that the windows do not show in the result.
     hidden = {*dims.collapsed_slice_dims, *dims.operand_batching_dims}
     window_shape = [size for axis, size in enumerate(sizes) if axis not in hidden]
     batching = (dims.operand_batching_dims, dims.start_indices_batching_dims)
@@ -125,8 +135,9 @@ def _gather_rule(graph: Graph, eqn: Equation, operand: Array, indices: Array) ->
     if not windows:
         return [arrays.zeros(aval)]
     gathered = np.stack(windows).reshape([*indices.shape[:-1], *window_shape])
-    first = indices.ndim - 1
-    sources = range(first, first + len(window_shape))
+    # The axes of the windows lie behind those of the indices, and go where XLA has them.
+    num_batch_axes = indices.ndim - 1
+    sources = range(num_batch_axes, num_batch_axes + len(window_shape))
     gathered = np.moveaxis(gathered, list(sources), list(dims.offset_dims))
     return [arrays.settle(gathered, aval.dtype)]
 
@@ -140,23 +151,30 @@ def _fill_outside(graph: Graph, eqn: Equation, values: Array, window: Window) ->
         high = graph.call("lt", index, index.dtype.type(count))
         inside = graph.call("and", inside, graph.call("and", low, high))
     value = eqn.params["fill_value"]
-    fill = dtype.type(_default_fill(dtype) if value is None else value)
+    if value is None:
+        value = _default_fill(dtype)
+    fill = dtype.type(value)
     return arrays.map_elements(
         lambda x: graph.select(inside, x, fill), values.shape, object, values
     )
 
 
 def _default_fill(dtype: np.dtype) -> Any:
+    """Returns what ``jax.lax.gather`` fills with where nothing else is said."""
     if np.issubdtype(dtype, np.signedinteger):
         return np.iinfo(dtype).min
     if np.issubdtype(dtype, np.unsignedinteger):
         return np.iinfo(dtype).max
-    return True if dtype == np.bool_ else np.nan
+    if dtype == np.bool_:
+        return True
+    return np.nan
 
 
 def _scatter(graph: Graph, eqn: Equation, *operands: Array, combine: Callable) -> Results:
+    """Combines a window of updates for each row of indices into a copy of the operand."""
     operand, indices, updates = operands
     dims = eqn.params["dimension_numbers"]
+    # Axes that the updates do not have, along which a window has the size 1.
     hidden = {*dims.inserted_window_dims, *dims.operand_batching_dims}
     window_axes = list(dims.update_window_dims)
     update_sizes = iter([updates.shape[axis] for axis in window_axes])
@@ -167,6 +185,7 @@ def _scatter(graph: Graph, eqn: Equation, *operands: Array, combine: Callable) -
     flat = arrays.lift(operand).reshape(-1).copy()
     batching = (dims.operand_batching_dims, dims.scatter_indices_batching_dims)
     starts = _starts(indices, operand.ndim, dims.scatter_dims_to_operand_dims, *batching)
+    # One after the other, as windows may overlap.
     for start, block in zip(starts, blocks, strict=True):
         if _outside_mode(eqn) == "clip":
             start = _clip(graph, start, operand.shape, sizes)
@@ -183,7 +202,8 @@ def _clip(graph: Graph, starts: Sequence[Any], shape: Sequence[int], sizes: Sequ
         if is_constant(start) or isinstance(start, int):
             clipped.append(min(max(int(start), 0), limit - size))
         else:
-            low, high = start.dtype.type(0), start.dtype.type(limit - size)
+            low = start.dtype.type(0)
+            high = start.dtype.type(limit - size)
             clipped.append(graph.call("min", graph.call("max", start, low), high))
     return clipped
 
@@ -198,6 +218,7 @@ def _dynamic_slice(graph: Graph, eqn: Equation, operand: Array, *starts: Array) 
 def _dynamic_update_slice(
     graph: Graph, eqn: Equation, operand: Array, update: Array, *starts: Array
 ) -> Results:
+    """Replaces a window, which XLA moves to the nearest place inside of the operand."""
     clipped = _clip(graph, [s[()] for s in starts], operand.shape, update.shape)
     flat = arrays.lift(operand).reshape(-1).copy()
     _write_window(graph, flat, _window(operand.shape, update.shape, clipped), update, _replace)

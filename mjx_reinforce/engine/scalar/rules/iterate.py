@@ -38,14 +38,14 @@ def iterate(
     length: int | None = None,
     active: int | None = None,
     xs: Sequence[list[Scalar]] = (),
-    kept: list[bool] | None = None,
+    unchanged: list[bool] | None = None,
 ) -> Loop:
     """Builds a loop.
 
     Every carry is first assumed to keep its initial value. The body is evaluated on that
     assumption, carries that break it are dropped from it, and so on until it holds: then it holds
     in every iteration. The same is done for 'all lanes agree'. Where this loop was built before, as
-    part of an outer loop's body, that begins with what was found then.
+    part of an outer loop's body, it begins with the assumptions that held then.
 
     Args:
       graph: where the loop is made.
@@ -54,22 +54,26 @@ def iterate(
       length: the number of iterations, or None for no limit.
       active: the position in the carry of the bool that ends the loop when no lane has it.
       xs: for each element, its value in each iteration.
-      kept: which of the carry keep their values, where that is known of the variables; then the
-        others are assumed to vary.
+      unchanged: which of the carry keep their values, where that is known of the variables; then
+        the others are assumed to vary.
     """
     make = functools.partial(Loop, graph.scope, 0, length, list(inits), active, list(xs))
-    place, count = (graph.path, active), len(inits)
-    first = Assumption(kept or [True] * count, [kept is not None] * count)
-    fixed, varying = graph.learned.get(place, first)
+    place = (graph.path, active)
+    count = len(inits)
+    initial = Assumption(unchanged or [True] * count, [unchanged is not None] * count)
+    fixed, varying = graph.findings.get(place, initial)
     varying = [v or varies(init) for v, init in zip(varying, inits, strict=True)]
+    # Assumptions are only ever dropped, so this ends.
     while True:
         loop = _trace_body(graph, step, make, fixed, varying)
         moved = [f and not same(n, i) for f, n, i in zip(fixed, loop.nexts, inits, strict=True)]
         differs = [varies(n) and not v for n, v in zip(loop.nexts, varying, strict=True)]
         fixed = [f and not m for f, m in zip(fixed, moved, strict=True)]
-        varying = [v or s for v, s in zip(varying, differs, strict=True)]
-        if not any(moved) and not any(s and not f for s, f in zip(differs, fixed, strict=True)):
-            graph.learned[place] = Assumption(fixed, varying)
+        varying = [v or d for v, d in zip(varying, differs, strict=True)]
+        # Whether lanes agree on a carry that keeps its value is decided by that value alone.
+        broken = [*moved, *(d and not f for d, f in zip(differs, fixed, strict=True))]
+        if not any(broken):
+            graph.findings[place] = Assumption(fixed, varying)
             return _close(graph, loop, varying)
 
 
@@ -88,19 +92,27 @@ def _trace_body(
     """Evaluates one iteration under the present assumptions."""
     with graph.loop_body() as body:
         loop = make(body)
+        # What is the same in every iteration has no leaf: it folds and simplifies as it is.
+        state = []
         for i, (init, is_fixed, v) in enumerate(zip(loop.inits, fixed, varying, strict=True)):
-            leaf = None if is_fixed else graph.leaf(init.dtype, v, loop, ("carry", i))
+            leaf = None
+            if not is_fixed:
+                leaf = graph.leaf(init.dtype, v, loop, ("carry", i))
             loop.carries.append(leaf)
+            state.append(leaf or init)
+        elements = []
         for j, row in enumerate(loop.xs):
-            same_throughout = all(same(x, row[0]) for x in row)
-            v = any(map(varies, row))
-            leaf = None if same_throughout else graph.leaf(row[0].dtype, v, loop, ("element", j))
+            leaf = None
+            if not all(same(x, row[0]) for x in row):
+                leaf = graph.leaf(row[0].dtype, any(map(varies, row)), loop, ("element", j))
             loop.elements.append(leaf)
-        state = [init if c is None else c for init, c in zip(loop.inits, loop.carries, strict=True)]
-        parts = [row[0] if e is None else e for row, e in zip(loop.xs, loop.elements, strict=True)]
+            elements.append(leaf or row[0])
         # Where all lanes are done, no iteration runs.
-        with graph.assuming(None if loop.active is None else state[loop.active]):
-            loop.nexts, loop.ys = step(state, parts)
+        is_active = None
+        if loop.active is not None:
+            is_active = state[loop.active]
+        with graph.assuming(is_active):
+            loop.nexts, loop.ys = step(state, elements)
     return loop
 
 
@@ -113,9 +125,11 @@ def _close(graph: Graph, loop: Loop, varying: list[bool]) -> Loop:
         for i, (carry, v) in enumerate(zip(loop.carries, varying, strict=True))
     ]
     for j, y in enumerate(loop.ys):
-        inside = isinstance(y, Node) and y.scope is loop.body
-        times = range(loop.length or 0) if inside else ()
-        leaves = [graph.leaf(y.dtype, y.varying, loop, ("y", j, t)) for t in times]
+        leaves = []
+        # What lies outside of the body is the same in every iteration, and needs no leaves.
+        if isinstance(y, Node) and y.scope is loop.body:
+            times = range(loop.length or 0)
+            leaves = [graph.leaf(y.dtype, y.varying, loop, ("y", j, t)) for t in times]
         loop.stacked.append(leaves)
     return loop
 
@@ -129,44 +143,61 @@ def has_loops(program: jaxprs.Program) -> bool:
     )
 
 
-def keeps(body: jaxprs.Program, first: int, count: int) -> list[bool]:
+def keeps(body: jaxprs.Program, start: int, count: int) -> list[bool]:
     """Returns which variables of the carry an iteration hands on as they are.
 
     Args:
       body: of the loop; its leading results are the carry.
-      first: the position of the carry among its arguments.
+      start: the position of the carry among its arguments.
       count: how many variables the carry has.
     """
     sources = _sources(body)
-    return [sources[k] == first + k for k in range(count)]
+    return [sources[k] == start + k for k in range(count)]
 
 
 def _sources(program: jaxprs.Program) -> list[int | None]:
     """Returns for each result of a program the argument that it is, or None."""
-    found: dict[Any, int] = {variable: k for k, variable in enumerate(program.jaxpr.invars)}
+    sources: dict[Any, int] = {variable: k for k, variable in enumerate(program.jaxpr.invars)}
     for eqn in program.jaxpr.eqns:
         for out, position in zip(eqn.outvars, _operands_returned(eqn), strict=False):
-            operand = None if position is None else eqn.invars[position]
-            if operand is not None and not jaxprs.is_literal(operand) and operand in found:
-                found[out] = found[operand]
+            if position is None or jaxprs.is_literal(eqn.invars[position]):
+                continue
+            operand = eqn.invars[position]
+            if operand in sources:
+                sources[out] = sources[operand]
     outs = program.jaxpr.outvars
-    return [None if jaxprs.is_literal(out) else found.get(out) for out in outs]
+    return [None if jaxprs.is_literal(out) else sources.get(out) for out in outs]
 
 
 def _operands_returned(eqn: Any) -> list[int | None]:
     """Returns for the leading results of an equation the operand that each is, or None."""
-    name, params = eqn.primitive.name, eqn.params
+    name = eqn.primitive.name
+    params = eqn.params
     if name == "scan":
-        first, count = jaxprs.scan_parts(eqn)
-        kept = keeps(jaxprs.program(params["jaxpr"]), first, count)
-        return [first + k if keep else None for k, keep in enumerate(kept)]
+        start, count = jaxprs.scan_parts(eqn)
+        return _where_kept(keeps(jaxprs.program(params["jaxpr"]), start, count), start)
     if name == "while":
-        first, count = params["body_nconsts"], len(eqn.outvars)
-        kept = keeps(jaxprs.program(params["body_jaxpr"]), first, count)
-        first += params["cond_nconsts"]
-        return [first + k if keep else None for k, keep in enumerate(kept)]
+        # Among the body's arguments, the carry comes behind the body's constants. Among the
+        # equation's operands, it comes behind those of the condition, too.
+        start = params["body_nconsts"]
+        unchanged = keeps(jaxprs.program(params["body_jaxpr"]), start, len(eqn.outvars))
+        return _where_kept(unchanged, params["cond_nconsts"] + start)
     if name == "cond":
-        columns = zip(*(_sources(jaxprs.program(b)) for b in params["branches"]), strict=True)
-        return [None if each[0] is None or len(set(each)) > 1 else 1 + each[0] for each in columns]
-    called = jaxprs.callee(eqn) if name in _CALLS else None
-    return [] if called is None else list(_sources(called))
+        # All branches must return the same argument. The first operand is the number of the branch.
+        positions: list[int | None] = []
+        for sources in zip(*(_sources(jaxprs.program(b)) for b in params["branches"]), strict=True):
+            source = sources[0]
+            if source is None or len(set(sources)) > 1:
+                positions.append(None)
+            else:
+                positions.append(1 + source)
+        return positions
+    program = jaxprs.callee(eqn) if name in _CALLS else None
+    if program is None:
+        return []
+    return list(_sources(program))
+
+
+def _where_kept(unchanged: list[bool], start: int) -> list[int | None]:
+    """Returns the position of each carry that keeps its value, the first at ``start``."""
+    return [start + k if keeps_value else None for k, keeps_value in enumerate(unchanged)]

@@ -28,19 +28,24 @@ from mjx_reinforce.engine.scalar.rules import iterate
 from mjx_reinforce.engine.scalar.rules.iterate import Iteration, varies
 
 
-def while_rule(graph: Graph, run: Callable, eqn: Equation, used: Any, *operands: Array) -> Results:
+def while_rule(graph: Graph, run: Callable, eqn: Equation, live: Any, *operands: Array) -> Results:
     """Makes a loop; a lane that is done keeps its values while others go on."""
-    num_cond, num_body = eqn.params["cond_nconsts"], eqn.params["body_nconsts"]
-    cond_consts, body_consts = operands[:num_cond], operands[num_cond : num_cond + num_body]
+    num_cond = eqn.params["cond_nconsts"]
+    num_body = eqn.params["body_nconsts"]
+    cond_consts = operands[:num_cond]
+    body_consts = operands[num_cond : num_cond + num_body]
     carry = arrays.Layout([out.aval for out in eqn.outvars])
-    cond, body = (jaxprs.program(eqn.params[name]) for name in ("cond_jaxpr", "body_jaxpr"))
+    cond = jaxprs.program(eqn.params["cond_jaxpr"])
+    body = jaxprs.program(eqn.params["body_jaxpr"])
 
     def goes_on(state: list[Scalar]) -> Scalar:
         return run(cond, [*cond_consts, *carry.pack(state)])[0][()]
 
     def step(state: list[Scalar], _: list[Scalar]) -> tuple[list[Scalar], list[Scalar]]:
+        """Computes one iteration; whether a lane goes on is the first of the carry."""
         active, *old = state
         new = carry.unpack(run(body, [*body_consts, *carry.pack(old)]))
+        # Lanes that share the predicate are done all at once: no iteration runs then.
         if varies(active):
             new = [graph.select(active, n, o) for n, o in zip(new, old, strict=True)]
             return [graph.call("and", active, goes_on(new)), *new], []
@@ -50,40 +55,47 @@ def while_rule(graph: Graph, run: Callable, eqn: Equation, used: Any, *operands:
     active = goes_on(start)
     if is_constant(active) and not active:
         return carry.pack(start)
-    kept = None
+    unchanged = None
     if iterate.has_loops(body) or iterate.has_loops(cond):
-        kept = [False, *carry.repeat(iterate.keeps(body, num_body, len(eqn.outvars)))]
-    loop = iterate.iterate(graph, step, [active, *start], active=0, kept=kept)
+        unchanged = [False, *carry.repeat(iterate.keeps(body, num_body, len(eqn.outvars)))]
+    loop = iterate.iterate(graph, step, [active, *start], active=0, unchanged=unchanged)
     return carry.pack(loop.results()[0][1:])
 
 
-def scan_rule(graph: Graph, run: Callable, eqn: Equation, used: Any, *operands: Array) -> Results:
+def scan_rule(graph: Graph, run: Callable, eqn: Equation, live: Any, *operands: Array) -> Results:
     """Writes a short scan out; makes a loop of a longer one, which may end early."""
-    length, (num_consts, num_carry) = eqn.params["length"], jaxprs.scan_parts(eqn)
+    length = eqn.params["length"]
+    num_consts, num_carry = jaxprs.scan_parts(eqn)
     body = jaxprs.program(eqn.params["jaxpr"])
     split = num_consts + num_carry
-    consts, init = list(operands[:num_consts]), operands[num_consts:split]
+    consts = operands[:num_consts]
+    init = operands[num_consts:split]
     carry = arrays.Layout([out.aval for out in eqn.outvars[:num_carry]])
     outs = arrays.Layout([out.aval for out in body.jaxpr.outvars[num_carry:]])
     ins = arrays.Layout([var.aval for var in body.jaxpr.invars[split:]])
-    order = range(length)[::-1] if eqn.params["reverse"] else range(length)
+    order = range(length)
+    if eqn.params["reverse"]:
+        order = order[::-1]
 
     def step(state: list[Scalar], row: list[Scalar]) -> tuple[list[Scalar], list[Scalar]]:
         results = run(body, [*consts, *carry.pack(state), *ins.pack(row)])
         return carry.unpack(results[:num_carry]), outs.unpack(results[num_carry:])
 
     rows = [ins.unpack([x[t : t + 1] for x in operands[split:]]) for t in order]
+    # Rows and the table of ys are in the order of the iterations.
     if length <= max(graph.scans, eqn.params["unroll"]):
-        final, table = carry.unpack(init), []
+        final = carry.unpack(init)
+        table = []
         for row in rows:
             final, ys = step(final, row)
             table.append(ys)
     else:
-        kept = None
+        unchanged = None
         if iterate.has_loops(body):
-            kept = carry.repeat(iterate.keeps(body, num_consts, num_carry))
-        final, table = _as_loop(graph, step, carry.unpack(init), rows, length, kept)
-    table = [table[k] for k in np.argsort(order)] if length else []
+            unchanged = carry.repeat(iterate.keeps(body, num_consts, num_carry))
+        final, table = _as_loop(graph, step, carry.unpack(init), rows, length, unchanged)
+    if eqn.params["reverse"]:
+        table = table[::-1]
     stacked = [outs.pack(row) for row in table]
     ys = [np.stack(arrays.together(column)) for column in zip(*stacked, strict=True)]
     if not table:
@@ -97,14 +109,18 @@ def _as_loop(
     inits: list,
     rows: list[list[Scalar]],
     length: int,
-    kept: list[bool] | None,
+    unchanged: list[bool] | None,
 ) -> tuple[list, list]:
     """Builds a scan's loop; returns the final carry and the ys of each iteration."""
     xs = [list(column) for column in zip(*rows, strict=True)]
-    loop = iterate.iterate(graph, step, inits, length=length, xs=xs, kept=kept)
-    switch = None if xs or loop.ys else _switch(loop)
-    if switch is not None:
-        loop = iterate.iterate(graph, step, inits, length=length, active=switch, kept=kept)
+    loop = iterate.iterate(graph, step, inits, length=length, xs=xs, unchanged=unchanged)
+    # A loop may end early if it neither reads rows nor makes ys: further iterations leave nothing.
+    if not xs and not loop.ys:
+        switch = _switch(loop)
+        if switch is not None:
+            loop = iterate.iterate(
+                graph, step, inits, length=length, active=switch, unchanged=unchanged
+            )
     final, columns = loop.results()
     return final, [list(row) for row in zip(*columns, strict=True)] or [[]] * length
 
@@ -119,9 +135,10 @@ def _switch(loop: Loop) -> int | None:
         switch = loop.carries[i]
         if switch is None or switch.dtype != np.bool_:
             continue
-        off = [_when_false(loop.nexts[k], switch) for k in changing]
-        kept = [np.False_ if k == i else loop.carries[k] for k in changing]
-        if all(same(value, before) for value, before in zip(off, kept, strict=True)):
+        # What the carry is after an iteration where the switch is off, and what it was before.
+        after = [_when_false(loop.nexts[k], switch) for k in changing]
+        before = [np.False_ if k == i else loop.carries[k] for k in changing]
+        if all(map(same, after, before)):
             return i
     return None
 
@@ -132,6 +149,7 @@ def _when_false(value: Scalar, switch: Node) -> Scalar:
         return np.False_
     if not isinstance(value, Node):
         return value
+    # A gate that is skipped gives what is cold; a selection has the case for False first.
     gate = value.owner
     if isinstance(gate, Gate) and gate.predicate is switch:
         return _when_false(gate.cold[value.position], switch)
@@ -156,41 +174,43 @@ class _Body(NamedTuple):
 
 
 def cond_rule(
-    graph: Graph, run: Callable, eqn: Equation, used: list[bool], *operands: Array
+    graph: Graph, run: Callable, eqn: Equation, live: list[bool], *operands: Array
 ) -> Results:
     """Evaluates the branches that lanes may take and picks each lane's own.
 
     Args:
       graph: where nodes are made.
-      run: (program, arguments, which results are used) -> results.
+      run: (program, arguments, which results something reads) -> results.
       eqn: the equation.
-      used: which of its results are used.
+      live: which of its results something reads.
       *operands: [] which branch is taken, and the arguments of every branch.
     """
     index, *arguments = operands
     programs = [jaxprs.program(branch) for branch in eqn.params["branches"]]
     (choice,) = arrays.elements(index)
     if is_constant(choice):
-        taken = programs[min(max(int(choice), 0), len(programs) - 1)]
-        return run(taken, arguments, used)
+        nearest = min(max(int(choice), 0), len(programs) - 1)
+        return run(programs[nearest], arguments, live)
     layout = arrays.Layout([out.aval for out in eqn.outvars])
 
     def branch(program: jaxprs.Program) -> Branch:
-        return lambda: layout.unpack(run(program, arguments, used))
+        return lambda: layout.unpack(run(program, arguments, live))
 
     return layout.pack(_choose_among(graph, [branch(program) for program in programs], choice))
 
 
 def skippable_rule(
-    graph: Graph, run: Callable, eqn: Equation, used: list[bool], *operands: Array
+    graph: Graph, run: Callable, eqn: Equation, live: list[bool], *operands: Array
 ) -> Results:
     """Skips a computation that no lane needs, if it is expensive; see ``skippable``."""
-    count, (needed, *others) = eqn.params["num_results"], operands
-    otherwise, consts = others[:count], others[count:]
+    needed, *leaves = operands
+    count = eqn.params["num_results"]
+    otherwise = leaves[:count]
+    consts = leaves[count:]
     layout = arrays.Layout([out.aval for out in eqn.outvars])
 
     def compute() -> list[Scalar]:
-        return layout.unpack(run(jaxprs.program(eqn.params["computation"]), consts, used))
+        return layout.unpack(run(jaxprs.program(eqn.params["computation"]), consts, live))
 
     (predicate,) = arrays.elements(needed)
     if is_constant(predicate) and not predicate:
@@ -198,50 +218,64 @@ def skippable_rule(
     body = _expensive(graph, compute, 0, predicate)
     if body is None:
         return layout.pack(compute())
+    # In a lane that does not need it the result equals ``otherwise``, so nothing is selected.
     return layout.pack(_close(graph, body, predicate, body.results, layout.unpack(otherwise)))
 
 
 def whole_rule(
-    graph: Graph, run: Callable, eqn: Equation, used: list[bool], *operands: Array
+    graph: Graph, run: Callable, eqn: Equation, live: list[bool], *operands: Array
 ) -> Results:
     """Keeps an operation whole; see ``whole``."""
     fields = tuple(field for field, *_ in eqn.params["results"])
     args = [arrays.elements(x) for x in operands]
     call = Call(graph.scope, graph.number(), eqn.params["name"], args, fields)
     results = []
-    for number, (out, use) in enumerate(zip(eqn.outvars, used, strict=True)):
-        size = num_entries(out.aval) if use else 0
-        leaves = [graph.leaf(out.aval.dtype, True, call, (number, k)) for k in range(size)]
+    for number, (out, is_live) in enumerate(zip(eqn.outvars, live, strict=True)):
+        # A result that nothing reads has no leaves, and the backend need not store it.
+        leaves = []
+        array = arrays.zeros(out.aval)
+        if is_live:
+            places = [(number, k) for k in range(num_entries(out.aval))]
+            leaves = [graph.leaf(out.aval.dtype, True, call, place) for place in places]
+            array = arrays.pack(leaves, out.aval.shape, out.aval.dtype)
         call.outs.append(leaves)
-        packed = arrays.pack(leaves, out.aval.shape, out.aval.dtype) if use else None
-        results.append(arrays.zeros(out.aval) if packed is None else packed)
+        results.append(array)
     return results
 
 
 def _choose_among(graph: Graph, branches: list[Branch], choice: Node) -> list[Scalar]:
     """Returns the results of the branch that each lane takes."""
     needed = [_takes(graph, choice, k, len(branches)) for k in range(len(branches))]
-    order, tried = list(range(len(branches))), {}
+    order = list(range(len(branches)))
+    bodies = {}
     if len(branches) == 2:
-        tried[0] = _expensive(graph, branches[0], 0, needed[0])
+        bodies[0] = _expensive(graph, branches[0], 0, needed[0])
         # The cheap branch comes first: its results are what a skipped one falls back on.
-        order = [0, 1] if tried[0] is None else [1, 0]
+        if bodies[0] is not None:
+            order = [1, 0]
     results: list[Scalar] | None = None
     for k in order:
-        body = tried[k] if k in tried else _expensive(graph, branches[k], k, needed[k])
+        if k not in bodies:
+            bodies[k] = _expensive(graph, branches[k], k, needed[k])
+        body = bodies[k]
         if body is not None:
             results = _gate(graph, body, needed[k], results)
             continue
-        others, results = results, branches[k]()
-        if others is not None:
-            results = _select_all(graph, needed[k], results, others)
+        # Every lane computes a cheap branch. The first of all branches needs no selection: each
+        # lane that takes another one overwrites it.
+        branch_results = branches[k]()
+        if results is not None:
+            branch_results = _select_all(graph, needed[k], branch_results, results)
+        results = branch_results
     return results or []
 
 
 def _takes(graph: Graph, choice: Node, k: int, count: int) -> Scalar:
     """Returns which lanes take branch k; a choice out of range takes the nearest."""
     if choice.dtype == np.bool_:
-        return choice if k else graph.call("not", choice)
+        if k == 0:
+            return graph.call("not", choice)
+        return choice
     number = choice.dtype.type
     if k == 0:
         return graph.call("lt", choice, number(1))
@@ -256,21 +290,24 @@ def _expensive(graph: Graph, branch: Branch, k: int, needed: Scalar) -> _Body | 
     What a cheap branch makes is dropped. A branch that was expensive once remains so where less is
     assumed.
     """
-    if not isinstance(needed, Node) or needed in graph.certain:
+    # A premise holds for some lane wherever this code runs: such a branch is never skipped.
+    if not isinstance(needed, Node) or needed in graph.premises:
         return None
     with graph.branch() as scope, graph.assuming(needed):
         results = branch()
     place = (graph.path, "expensive", k)
-    if place not in graph.learned:
+    if place not in graph.findings:
         if not scope.has_loop and scope.cost <= graph.branch_cost:
             return None
-        graph.learned[place] = True
+        graph.findings[place] = True
     return _Body(scope, results)
 
 
 def _gate(graph: Graph, body: _Body, needed: Node, fallback: list[Scalar] | None) -> list[Scalar]:
     """Makes an expensive branch one that is skipped where no lane needs it."""
-    cold = fallback or [result.dtype.type(0) for result in body.results]
+    # Without a fallback any value does: where the branch is skipped, no lane takes it.
+    cold = fallback or [value.dtype.type(0) for value in body.results]
+    # Inside of the branch, so that a skipped one selects nothing either.
     with graph.again(body.scope), graph.assuming(needed):
         hot = _select_all(graph, needed, body.results, cold)
     return _close(graph, body, needed, hot, cold)
@@ -283,7 +320,9 @@ def _close(
     gate = Gate(graph.scope, graph.number(), needed, body.scope, hot, cold)
     for position, (on, off) in enumerate(zip(hot, cold, strict=True)):
         varying = any(isinstance(value, Node) and value.varying for value in (on, off))
-        leaf = None if same(on, off) else graph.leaf(on.dtype, varying, gate, position)
+        leaf = None
+        if not same(on, off):
+            leaf = graph.leaf(on.dtype, varying, gate, position)
         gate.outs.append(leaf)
     return [off if out is None else out for out, off in zip(gate.outs, cold, strict=True)]
 

@@ -16,11 +16,12 @@ from mjx_reinforce.engine.scalar.jaxprs import Equation
 
 def _reduce(graph: Graph, eqn: Equation, x: Array, *, combine: str, empty: float) -> list:
     """Combines the elements along some axes, from the first to the last."""
-    axes, aval = tuple(eqn.params["axes"]), eqn.outvars[0].aval
+    axes = tuple(eqn.params["axes"])
+    aval = eqn.outvars[0].aval
     if x.size == 0:
         return [np.full(aval.shape, empty, aval.dtype)]
-    kept = [axis for axis in range(x.ndim) if axis not in axes]
-    rows = x.transpose([*kept, *axes]).reshape([int(np.prod(aval.shape, dtype=int)), -1])
+    free = [axis for axis in range(x.ndim) if axis not in axes]
+    rows = x.transpose([*free, *axes]).reshape([int(np.prod(aval.shape, dtype=int)), -1])
     function = functools.partial(graph.call, combine)
     reduced = (functools.reduce(function, arrays.elements(row)) for row in rows)
     return [arrays.pack(reduced, aval.shape, aval.dtype)]
@@ -39,28 +40,35 @@ def _cumulate(graph: Graph, eqn: Equation, x: Array, *, combine: str) -> list:
 
 def _arg_extreme(graph: Graph, eqn: Equation, x: Array, *, better: str) -> Results:
     """The position of the first extreme element; the first NaN counts as extreme."""
-    (axis,), aval = eqn.params["axes"], eqn.outvars[0].aval
+    (axis,) = eqn.params["axes"]
+    aval = eqn.outvars[0].aval
     rows = np.moveaxis(x, axis, -1).reshape(-1, x.shape[axis])
     positions = [_first_extreme(graph, arrays.elements(row), better, aval.dtype) for row in rows]
     return [arrays.pack(positions, aval.shape, aval.dtype)]
 
 
 def _first_extreme(graph: Graph, row: list, better: str, dtype: np.dtype) -> Any:
-    best, where = row[0], dtype.type(0)
+    """Returns the position in a row of the element that is better than all others."""
+    best = row[0]
+    position = dtype.type(0)
     for i, value in enumerate(row[1:], 1):
+        # A NaN wins against numbers, and nothing wins against it: best == best is false for it.
         wins = graph.call("or", graph.call(better, value, best), graph.call("ne", value, value))
         wins = graph.call("and", wins, graph.call("eq", best, best))
         best = graph.select(wins, value, best)
-        where = graph.select(wins, dtype.type(i), where)
-    return where
+        position = graph.select(wins, dtype.type(i), position)
+    return position
 
 
 def _sort(graph: Graph, eqn: Equation, *operands: Array) -> Results:
     """Sorts short arrays by exchanging neighbors, which is stable; NaN comes last."""
-    axis, num_keys = eqn.params["dimension"], eqn.params["num_keys"]
+    axis = eqn.params["dimension"]
+    num_keys = eqn.params["num_keys"]
     columns = [np.moveaxis(arrays.lift(x), axis, -1).copy() for x in operands]
     size = columns[0].shape[-1]
     for lines in zip(*(column.reshape(-1, size) for column in columns), strict=True):
+        # As many rounds as elements: in each, pairs of neighbors, the even and the odd ones in
+        # turn.
         for start in range(size):
             for i in range(start % 2, size - 1, 2):
                 _exchange(graph, lines, i, num_keys)
@@ -73,19 +81,24 @@ def _sort(graph: Graph, eqn: Equation, *operands: Array) -> Results:
 def _exchange(graph: Graph, lines: Any, i: int, num_keys: int) -> None:
     """Puts elements i and i + 1 in order, in place."""
     swap = np.False_
+    # From the last key to the first: where a key is equal, the keys behind it decide.
     for line in reversed(lines[:num_keys]):
-        less = _precedes(graph, line[i + 1], line[i])
-        equal = graph.call("not", graph.call("or", less, _precedes(graph, line[i], line[i + 1])))
-        swap = graph.call("or", less, graph.call("and", equal, swap))
+        is_less = _precedes(graph, line[i + 1], line[i])
+        is_greater = _precedes(graph, line[i], line[i + 1])
+        equal = graph.call("not", graph.call("or", is_less, is_greater))
+        swap = graph.call("or", is_less, graph.call("and", equal, swap))
     for line in lines:
-        low, high = line[i], line[i + 1]
-        line[i], line[i + 1] = graph.select(swap, high, low), graph.select(swap, low, high)
+        low = line[i]
+        high = line[i + 1]
+        line[i] = graph.select(swap, high, low)
+        line[i + 1] = graph.select(swap, low, high)
 
 
 def _precedes(graph: Graph, x: Any, y: Any) -> Any:
     """Returns whether x < y, where NaN is above everything."""
-    number, nan = graph.call("eq", x, x), graph.call("ne", y, y)
-    return graph.call("or", graph.call("lt", x, y), graph.call("and", number, nan))
+    is_number = graph.call("eq", x, x)
+    is_nan = graph.call("ne", y, y)
+    return graph.call("or", graph.call("lt", x, y), graph.call("and", is_number, is_nan))
 
 
 def _reducer(combine: str, empty: float) -> Callable:
@@ -93,15 +106,16 @@ def _reducer(combine: str, empty: float) -> Callable:
 
 
 def _dot_general(graph: Graph, eqn: Equation, x: Array, y: Array) -> Results:
+    """Returns a dot product for each pair of a row of x and one of y, batch by batch."""
     (x_sum, y_sum), (x_batch, y_batch) = eqn.params["dimension_numbers"]
     aval = eqn.outvars[0].aval
     x_rows = _as_matrices(_cast(graph, eqn.invars[0].aval, x, aval.dtype), x_batch, x_sum)
     y_rows = _as_matrices(_cast(graph, eqn.invars[1].aval, y, aval.dtype), y_batch, y_sum)
     products = [
-        _dot(graph, arrays.elements(left), arrays.elements(right), aval.dtype)
+        _dot(graph, arrays.elements(x_row), arrays.elements(y_row), aval.dtype)
         for x_matrix, y_matrix in zip(x_rows, y_rows, strict=True)
-        for left in x_matrix
-        for right in y_matrix
+        for x_row in x_matrix
+        for y_row in y_matrix
     ]
     return [arrays.pack(products, aval.shape, aval.dtype)]
 
@@ -120,35 +134,37 @@ def _as_matrices(x: Array, batch: tuple, contracted: tuple) -> Array:
     return x.transpose([*batch, *free, *contracted]).reshape(sizes)
 
 
-def _dot(graph: Graph, left: list, right: list, dtype: DTypeLike) -> Any:
-    terms = [graph.call("mul", a, b) for a, b in zip(left, right, strict=True)]
+def _dot(graph: Graph, x: list, y: list, dtype: DTypeLike) -> Any:
+    # From 0 on, which folds away: there may be no terms.
+    terms = [graph.call("mul", a, b) for a, b in zip(x, y, strict=True)]
     add = functools.partial(graph.call, "add")
     return functools.reduce(add, terms, np.dtype(dtype).type(0))
 
 
-def _minus_dot(graph: Graph, start: Any, left: list, right: list) -> Any:
-    for a, b in zip(left, right, strict=True):
+def _minus_dot(graph: Graph, start: Any, x: list, y: list) -> Any:
+    for a, b in zip(x, y, strict=True):
         start = graph.call("sub", start, graph.call("mul", a, b))
     return start
 
 
 def _cholesky(graph: Graph, eqn: Equation, x: Array) -> Results:
     """The lower factor; NaN where the matrix is not positive definite."""
-    size, dtype = x.shape[-1], eqn.outvars[0].aval.dtype
-    factors = [
-        _factor(graph, arrays.lift(matrix), size, dtype) for matrix in x.reshape(-1, size, size)
-    ]
+    size = x.shape[-1]
+    dtype = eqn.outvars[0].aval.dtype
+    matrices = arrays.lift(x).reshape(-1, size, size)
+    factors = [_factor(graph, matrix, size, dtype) for matrix in matrices]
     return [arrays.settle(np.stack(factors).reshape(x.shape), dtype)]
 
 
 def _factor(graph: Graph, matrix: Array, size: int, dtype: DTypeLike) -> Array:
+    """Returns the lower factor of one matrix, column by column."""
     lower = arrays.lift(np.zeros((size, size), dtype))
     for j in range(size):
         row = list(lower[j, :j])
         lower[j, j] = graph.call("sqrt", _minus_dot(graph, matrix[j, j], row, row))
         for i in range(j + 1, size):
-            rest = _minus_dot(graph, matrix[i, j], list(lower[i, :j]), row)
-            lower[i, j] = _divided(graph, rest, lower[j, j])
+            numerator = _minus_dot(graph, matrix[i, j], list(lower[i, :j]), row)
+            lower[i, j] = _divided(graph, numerator, lower[j, j])
     return lower
 
 
@@ -159,31 +175,44 @@ def _divided(graph: Graph, value: Any, pivot: Any) -> Any:
 
 def _triangular_solve(graph: Graph, eqn: Equation, a: Array, b: Array) -> Results:
     """Solves op(a) x = b, or x op(a) = b, matrix by matrix."""
-    params, aval = eqn.params, eqn.outvars[0].aval
-    lower = params["lower"] != params["transpose_a"]
-    matrices = np.swapaxes(a, -1, -2) if params["transpose_a"] else a
+    params = eqn.params
+    aval = eqn.outvars[0].aval
+    lower = params["lower"]
+    if params["transpose_a"]:
+        a = np.swapaxes(a, -1, -2)
+        lower = not lower
     if not params["left_side"]:  # x a = b is a' x' = b'
-        matrices, b, lower = np.swapaxes(matrices, -1, -2), np.swapaxes(b, -1, -2), not lower
-    batch, (size, columns) = b.shape[:-2], b.shape[-2:]
+        a = np.swapaxes(a, -1, -2)
+        b = np.swapaxes(b, -1, -2)
+        lower = not lower
+    *batch, size, columns = b.shape
+    matrices = a.reshape(-1, size, size)
+    blocks = b.reshape(-1, size, columns)
     solved = [
         _substitute(graph, matrix, column, lower, params["unit_diagonal"])
-        for matrix, block in zip(
-            matrices.reshape(-1, size, size), b.reshape(-1, size, columns), strict=True
-        )
+        for matrix, block in zip(matrices, blocks, strict=True)
         for column in block.T
     ]
+    # Its rows are the solved columns: those of x, or of x' where the equation was transposed.
     x = arrays.pack(itertools.chain(*solved), (*batch, columns, size), aval.dtype)
-    return [np.swapaxes(x, -1, -2) if params["left_side"] else x]
+    if params["left_side"]:
+        x = np.swapaxes(x, -1, -2)
+    return [x]
 
 
 def _substitute(graph: Graph, matrix: Array, rhs: Any, lower: bool, unit: bool) -> list:
     """Solves one triangular system by substitution."""
-    matrix, solution = arrays.lift(matrix), arrays.elements(rhs)
+    matrix = arrays.lift(matrix)
+    solution = arrays.elements(rhs)
     size = len(solution)
-    for i in range(size) if lower else range(size - 1, -1, -1):
-        known = slice(0, i) if lower else slice(i + 1, size)
-        rest = _minus_dot(graph, solution[i], list(matrix[i, known]), solution[known])
-        solution[i] = rest if unit else _divided(graph, rest, matrix[i, i])
+    # Each unknown needs those before it in a lower matrix, those behind it in an upper one.
+    order = range(size) if lower else range(size - 1, -1, -1)
+    for i in order:
+        solved = slice(0, i) if lower else slice(i + 1, size)
+        value = _minus_dot(graph, solution[i], list(matrix[i, solved]), solution[solved])
+        if not unit:
+            value = _divided(graph, value, matrix[i, i])
+        solution[i] = value
     return solution
 
 

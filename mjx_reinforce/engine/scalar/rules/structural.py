@@ -1,5 +1,6 @@
 """Rules that move elements about, and those that work on each element alone."""
 
+import functools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -38,25 +39,31 @@ def _split(graph: Graph, eqn: Equation, x: Array) -> Results:
 
 
 def _pad(graph: Graph, eqn: Equation, x: Array, value: Array) -> Results:
+    """Writes x, spread by the interior padding, into an array of the value."""
     x, value = arrays.together([x, value])
     shape = eqn.outvars[0].aval.shape
     padded = np.broadcast_to(value, shape).copy()
-    target, origin = [], []
+    target = []
+    origin = []
     for size, limit, (low, _, interior) in zip(
         x.shape, shape, eqn.params["padding_config"], strict=True
     ):
         places = low + np.arange(size) * (interior + 1)
-        kept = (places >= 0) & (places < limit)
-        target.append(places[kept])
-        origin.append(np.flatnonzero(kept))
+        # Negative padding cuts entries off.
+        is_inside = (places >= 0) & (places < limit)
+        target.append(places[is_inside])
+        origin.append(np.flatnonzero(is_inside))
     padded[np.ix_(*target)] = x[np.ix_(*origin)]
     return [padded]
 
 
 def _iota(graph: Graph, eqn: Equation) -> Results:
-    aval, axis = eqn.outvars[0].aval, eqn.params["dimension"]
+    """Counts along one axis."""
+    aval = eqn.outvars[0].aval
+    axis = eqn.params["dimension"]
     line = np.arange(aval.shape[axis]).astype(aval.dtype)
-    aligned = [-1 if i == axis else 1 for i in range(len(aval.shape))]
+    aligned = [1] * len(aval.shape)
+    aligned[axis] = -1
     return [np.broadcast_to(line.reshape(aligned), aval.shape)]
 
 
@@ -72,24 +79,31 @@ def _moved(move: Callable[..., Array]) -> Callable[..., Results]:
     return lambda graph, eqn, *operands: [move(eqn.params, eqn.outvars[0].aval, *operands)]
 
 
+#: What changes no element here. A key is an array of its words, wrapped or not.
 _IDENTITIES = (
-    *("copy", "copy_p", "device_put", "name", "optimization_barrier", "pvary", "random_wrap"),
-    *("random_unwrap", "reshard", "sharding_constraint", "stop_gradient"),
-)
+    "copy", "copy_p", "device_put", "name", "optimization_barrier", "pvary", "random_wrap",
+    "random_unwrap", "reshard", "sharding_constraint", "stop_gradient",
+)  # fmt: skip
 
 
 def _elementwise(graph: Graph, eqn: Equation, *operands: Array) -> Results:
     """The general rule: the operation has the primitive's name."""
     name = eqn.primitive.name
-    params = tuple(sorted(eqn.params.items())) if FACTS[name].has_params else ()
+    params = ()
+    if FACTS[name].has_params:
+        params = tuple(sorted(eqn.params.items()))
     return [_map_op(graph, Op(name, params), eqn.outvars[0].aval, operands)]
 
 
 def _map_op(graph: Graph, op: Op, aval: jaxprs.Shape, operands: Sequence[Array]) -> Array:
+    """Returns the array of an operation, whose operands broadcast to the shape of ``aval``."""
+    # All elements at once in NumPy: a model's constants are large arrays.
     if all(map(arrays.is_numeric, operands)):
         return np.asarray(simplify.fold(op, operands, aval.dtype))
-    apply, dtype = graph.apply, np.dtype(aval.dtype)
-    return arrays.map_elements(lambda *args: apply(op, args, dtype), aval.shape, dtype, *operands)
+    dtype = np.dtype(aval.dtype)
+    return arrays.map_elements(
+        lambda *args: graph.apply(op, args, dtype), aval.shape, dtype, *operands
+    )
 
 
 def _convert(graph: Graph, eqn: Equation, x: Array) -> Results:
@@ -113,17 +127,16 @@ def _clamp(graph: Graph, eqn: Equation, low: Array, x: Array, high: Array) -> Re
 
 def _integer_pow(graph: Graph, eqn: Equation, x: Array) -> Results:
     aval = eqn.outvars[0].aval
-    return [
-        arrays.map_elements(
-            lambda base: simplify.power(graph, base, eqn.params["y"]), aval.shape, aval.dtype, x
-        )
-    ]
+    power = functools.partial(simplify.power, graph, exponent=eqn.params["y"])
+    return [arrays.map_elements(power, aval.shape, aval.dtype, x)]
 
 
 def _pow_rule(graph: Graph, eqn: Equation, x: Array, y: Array) -> Results:
     """An exponent may be an integer under a float base."""
-    exponent = y if y.dtype in (object, x.dtype) else y.astype(eqn.outvars[0].aval.dtype)
-    return [_map_op(graph, Op("pow"), eqn.outvars[0].aval, (x, exponent))]
+    aval = eqn.outvars[0].aval
+    if y.dtype not in (object, x.dtype):
+        y = y.astype(aval.dtype)
+    return [_map_op(graph, Op("pow"), aval, (x, y))]
 
 
 RULES = {
