@@ -234,33 +234,33 @@ def _from_edge(
 
 
 @collider(ncon=8)
-def box_box(first: GeomInfo, second: GeomInfo) -> Collision:
+def box_box(box1: GeomInfo, box2: GeomInfo) -> Collision:
     """Collides boxes: at the corners of where two faces overlap, or where two edges cross."""
     # Stage 1 of ``mjc_BoxBox``: of 15 directions the one in which the boxes are farthest apart.
-    turn = first.mat.T @ second.mat
-    offset = (second.pos - first.pos) @ first.mat
-    back = (first.pos - second.pos) @ second.mat
-    sizes = jnp.stack([first.size, second.size])
-    first_gaps = jnp.abs(offset) - first.size - jnp.abs(turn) @ second.size
-    second_gaps = jnp.abs(back) - second.size - first.size @ jnp.abs(turn)
-    face_gaps = jnp.concatenate([first_gaps, second_gaps])
+    turn = box1.mat.T @ box2.mat
+    offset = (box2.pos - box1.pos) @ box1.mat
+    back = (box1.pos - box2.pos) @ box2.mat
+    sizes = jnp.stack([box1.size, box2.size])
+    gaps1 = jnp.abs(offset) - box1.size - jnp.abs(turn) @ box2.size
+    gaps2 = jnp.abs(back) - box2.size - box1.size @ jnp.abs(turn)
+    face_gaps = jnp.concatenate([gaps1, gaps2])
     axes, edge_gaps = _edge_axes(turn, offset, sizes)
     normals = jnp.concatenate([jnp.eye(3), turn.T])
     face, edge = _touching(face_gaps, edge_gaps, normals, axes)
 
     # Stage 2: the box whose face it is clips the other's. Both ways are computed, as JAX would.
-    is_first = jnp.any(face[:3])
+    is_face1 = jnp.any(face[:3])
     face_contacts = jax.tree.map(
-        lambda x, y: jnp.where(is_first, x, y),
+        lambda x, y: jnp.where(is_face1, x, y),
         _meet_at_face(face[:3], turn, offset, sizes),
         _meet_at_face(face[3:], turn.T, back, sizes[::-1]),
     )
     dist, pos, normal = face_contacts
-    origin = jnp.where(is_first, first.pos, second.pos)
-    mat = jnp.where(is_first, first.mat, second.mat)
+    origin = jnp.where(is_face1, box1.pos, box2.pos)
+    mat = jnp.where(is_face1, box1.mat, box2.mat)
     pos = origin + pos @ mat.T
     # MuJoCo's normals look from the first geom to the second.
-    normal = mat @ jnp.where(is_first, normal, -normal)
+    normal = mat @ jnp.where(is_face1, normal, -normal)
 
     # Two edges that cross have one contact; the other seven are far.
     crosses = jnp.any(edge)
@@ -268,8 +268,8 @@ def box_box(first: GeomInfo, second: GeomInfo) -> Collision:
         edge.reshape(3, 3), _chosen(edge, axes), turn, offset, sizes
     )
     dist = jnp.where(crosses, jnp.where(np.arange(8) == 0, depth, FAR), dist)
-    pos = jnp.where(crosses, first.pos + first.mat @ middle, pos)
-    frame = make_frame(jnp.where(crosses, first.mat @ axis, normal))
+    pos = jnp.where(crosses, box1.pos + box1.mat @ middle, pos)
+    frame = make_frame(jnp.where(crosses, box1.mat @ axis, normal))
     return dist, pos, jnp.broadcast_to(frame, (8, 3, 3))
 
 

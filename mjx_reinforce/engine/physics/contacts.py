@@ -120,17 +120,17 @@ def sphere_capsule(sphere: GeomInfo, capsule: GeomInfo) -> Collision:
 
 
 @collider(ncon=1)
-def capsule_capsule(first: GeomInfo, second: GeomInfo) -> Collision:
+def capsule_capsule(capsule1: GeomInfo, capsule2: GeomInfo) -> Collision:
     """Collides two capsules where their axes are closest."""
-    point1, point2 = _closest_points(first, second)
-    return _collide_spheres(first, point1, second, point2)
+    point1, point2 = _closest_points(capsule1, capsule2)
+    return _collide_spheres(capsule1, point1, capsule2, point2)
 
 
-def _closest_points(first: GeomInfo, second: GeomInfo) -> tuple[jax.Array, jax.Array]:
+def _closest_points(capsule1: GeomInfo, capsule2: GeomInfo) -> tuple[jax.Array, jax.Array]:
     """Returns the point of each capsule's axis that is closest to the other's axis, [3] each."""
-    axis1 = first.mat[:, 2] * first.size[1]
-    axis2 = second.mat[:, 2] * second.size[1]
-    offset = first.pos - second.pos
+    axis1 = capsule1.mat[:, 2] * capsule1.size[1]
+    axis2 = capsule2.mat[:, 2] * capsule2.size[1]
+    offset = capsule1.pos - capsule2.pos
 
     def meet(along1: float | jax.Array) -> jax.Array:
         """Returns a place on the first axis and the closest on the second, in half lengths."""
@@ -150,7 +150,7 @@ def _closest_points(first: GeomInfo, second: GeomInfo) -> tuple[jax.Array, jax.A
     # Parallel axes are closest all along their overlap. C has a contact at each of its ends.
     middle = (meet(-1.0) + meet(1.0)) / 2
     along1, along2 = jnp.where(parallel, middle, meet(jnp.clip(crossing, -1, 1)))
-    return first.pos + along1 * axis1, second.pos + along2 * axis2
+    return capsule1.pos + along1 * axis1, capsule2.pos + along2 * axis2
 
 
 @collider(ncon=1)
@@ -267,15 +267,15 @@ def _collide_points(plane: GeomInfo, points: jax.Array) -> Collision:
 
 
 def _collide_spheres(
-    first: GeomInfo, point1: jax.Array, second: GeomInfo, point2: jax.Array
+    geom1: GeomInfo, point1: jax.Array, geom2: GeomInfo, point2: jax.Array
 ) -> Collision:
     """Collides spheres of two geoms' radii about given points."""
     normal, length = _direction(point2 - point1)
     # Points at one place have no direction between them: C then takes that across both axes.
-    across, _ = _direction(jnp.cross(first.mat[:, 2], second.mat[:, 2]))
+    across, _ = _direction(jnp.cross(geom1.mat[:, 2], geom2.mat[:, 2]))
     normal = jnp.where(length == 0, across, normal)
-    dist = length - (first.size[0] + second.size[0])
-    return dist, point1 + normal * (first.size[0] + dist / 2), make_frame(normal)
+    dist = length - (geom1.size[0] + geom2.size[0])
+    return dist, point1 + normal * (geom1.size[0] + dist / 2), make_frame(normal)
 
 
 def _direction(vector: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -300,11 +300,11 @@ def one_by_one(collide: Collide) -> Collide:
         """Collides pairs of geoms [P, 2], as ``collide``; written out, in a loop over them."""
         if model.npair or not is_written_out():  # pairs have margins of their own
             return collide(model, data, key, geoms)
-        first, second = geoms.T
+        geom1, geom2 = geoms.T
         fields = data.geom_xpos, data.geom_xmat, model.geom_size
-        spheres = model.geom_rbound[first] + model.geom_rbound[second]
-        margins = model.geom_margin[first] + model.geom_margin[second]
-        rows = *(jnp.stack([x[first], x[second]], 1) for x in fields), spheres, margins
+        spheres = model.geom_rbound[geom1] + model.geom_rbound[geom2]
+        margins = model.geom_margin[geom1] + model.geom_margin[geom2]
+        rows = *(jnp.stack([x[geom1], x[geom2]], 1) for x in fields), spheres, margins
 
         def collide_pair(
             pos: jax.Array, mat: jax.Array, size: jax.Array, spheres: Any, margin: jax.Array

@@ -128,7 +128,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.A
     Returns:
       The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
     """
-    problem = newton.posed(model, data)
+    problem = newton.problem_of(model, data)
     rows = problem.rows
     inertia = problem.inertia
     tolerance = model.opt.tolerance

@@ -72,12 +72,12 @@ def check_lookup(function: Callable[..., Any], name: str) -> None:
     """
     # The code of functions that it defines is among its constants.
     code = inspect.unwrap(function).__code__
-    inner = [part for part in code.co_consts if isinstance(part, types.CodeType)]
-    if not any(name in part.co_names for part in (code, *inner)):
-        tested = " and ".join(f"{package}=={tag}.*" for package, tag in TESTED_VERSIONS.items())
+    nested = [const for const in code.co_consts if isinstance(const, types.CodeType)]
+    if not any(name in function_code.co_names for function_code in (code, *nested)):
+        versions = " and ".join(f"{package}=={tag}.*" for package, tag in TESTED_VERSIONS.items())
         raise RuntimeError(
             f"{function.__module__}.{function.__name__} does not look up {name}, which "
-            f"mjx_reinforce replaces: install {tested}, or adapt {__name__}"
+            f"mjx_reinforce replaces: install {versions}, or adapt {__name__}"
         )
 
 
@@ -125,12 +125,12 @@ def wrap_points(
     order = []
     wraps = []
     for inside in (False, True):
-        chosen = np.flatnonzero(fields.is_wrap_inside == inside)
-        if chosen.size:
+        indices = np.flatnonzero(fields.is_wrap_inside == inside)
+        if indices.size:
             static = inside, *search, fields.wrap_inside_z_init
             wrap = jax.vmap(lambda *x, static=static: support.wrap(*x, *static))
-            wraps.append(wrap(*(x[chosen] for x in arguments)))
-            order.append(chosen)
+            wraps.append(wrap(*(x[indices] for x in arguments)))
+            order.append(indices)
     inverse = np.argsort(np.concatenate(order))
     length, point1, point2 = (jnp.concatenate(x)[inverse] for x in zip(*wraps, strict=True))
     # A tendon that misses its geom has a length of -1 on it.

@@ -203,7 +203,7 @@ def solve_newton(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array
     Returns:
       The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
     """
-    problem = posed(model, data)
+    problem = problem_of(model, data)
     rows = problem.rows
     inertia = problem.inertia
     min_decrement = smallest_decrement(model, inertia)
@@ -235,7 +235,7 @@ def solve_newton(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array
     return problem.solution(descend(model.opt.iterations, improve, start(model, data, problem)))
 
 
-def posed(model: mjx.Model, data: mjx.Data) -> Problem:
+def problem_of(model: mjx.Model, data: mjx.Data) -> Problem:
     """Returns the problem of data with its constraint rows made."""
     fields = jax_fields(data)
     # MuJoCo's order of rows: ne of equalities, nf of friction loss, nl of limits, then contacts.

@@ -46,9 +46,9 @@ def make_constraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     blocks = [rows_of(make_rows(model, with_contact(data, contact, np.zeros(0, int))))]
     # In MJX's order, which is that of the dimensions.
     for dim in (1, 3, 4, 6):
-        chosen = np.flatnonzero(contact.dim == dim)
-        if chosen.size:
-            blocks.append(_contact_rows(model, data, int(dim), chosen))
+        indices = np.flatnonzero(contact.dim == dim)
+        if indices.size:
+            blocks.append(_contact_rows(model, data, int(dim), indices))
     rows = [jnp.concatenate(field) for field in zip(*blocks, strict=True)]
     return _with_changes(model, with_rows(data, rows))
 
@@ -94,7 +94,7 @@ def _rate(model: mjx.Model, data: mjx.Data) -> jax.Array:
     return jnp.concatenate(rates)
 
 
-def _contact_rows(model: mjx.Model, data: mjx.Data, dim: int, chosen: np.ndarray) -> list[Any]:
+def _contact_rows(model: mjx.Model, data: mjx.Data, dim: int, indices: np.ndarray) -> list[Any]:
     """Makes the rows of these contacts, all of one dimension, in a loop."""
     disableflags = model.opt.disableflags | _ONLY_CONTACTS
     contacts_only = model.replace(opt=model.opt.replace(disableflags=disableflags))
@@ -114,6 +114,6 @@ def _contact_rows(model: mjx.Model, data: mjx.Data, dim: int, chosen: np.ndarray
             touching,
         )
 
-    contacts = jax.tree.map(lambda x: x[chosen], contact)
+    contacts = jax.tree.map(lambda x: x[indices], contact)
     rows = short_scan(make, None, contacts)[1]
     return [x.reshape(-1, *x.shape[2:]) for x in rows]

@@ -30,27 +30,27 @@ _OF_BODIES = (
 _NO_TYPE = -1
 _FOR_SENSORS = "cacc", "cfrc_int", "cfrc_ext", "subtree_linvel", "subtree_angmom"
 #: What is computed only for sensors.
-Shown: TypeAlias = dict[str, Any]
+Readings: TypeAlias = dict[str, Any]
 
 
 def rne_postconstraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Computes cfrc_ext, cfrc_int and cacc, as ``mj_rnePostConstraint``."""
-    model, counted = _existing(model, data)
-    return _like(mjx.rne_postconstraint(model, _with_tendons(model, counted)), data)
+    model, existing = _existing(model, data)
+    return _like(mjx.rne_postconstraint(model, _with_tendons(model, existing)), data)
 
 
 def sensor_acc(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Computes the sensors of forces and accelerations, as ``mj_sensorAcc``."""
-    model, counted = _existing(model, data)
+    model, existing = _existing(model, data)
     # These read ``cacc`` and ``cfrc_int``, for which MJX calls its ``rne_postconstraint``.
     if np.isin(model.sensor_type, _OF_BODIES).any():
-        counted = _with_tendons(model, counted)
+        existing = _with_tendons(model, existing)
     # MJX fails on sensors of contacts where there can be none; left out, they show zero.
-    if not jax_fields(counted).contact.dim.size:
+    if not jax_fields(existing).contact.dim.size:
         is_contact = np.isin(model.sensor_type, _OF_CONTACTS)
         sensor_type = np.where(is_contact, _NO_TYPE, model.sensor_type)
         model = model.replace(sensor_type=sensor_type)
-    return _like(_cut(model, mjx.sensor_acc(model, counted)), data)
+    return _like(_cut(model, mjx.sensor_acc(model, existing)), data)
 
 
 def _cut(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -63,7 +63,7 @@ def _cut(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return data.replace(sensordata=jnp.clip(data.sensordata, -cutoff, cutoff))
 
 
-def shown(model: mjx.Model, data: mjx.Data) -> Shown:
+def readings(model: mjx.Model, data: mjx.Data) -> Readings:
     """Returns what is computed only for sensors; nothing if the model has none."""
     if not model.nsensor:
         return {}
@@ -71,11 +71,11 @@ def shown(model: mjx.Model, data: mjx.Data) -> Shown:
     return {"sensordata": data.sensordata, "fields": fields}
 
 
-def with_shown(data: mjx.Data, sensed: Shown) -> mjx.Data:
-    """Returns the data with what ``shown`` returned."""
-    if not sensed:
+def with_readings(data: mjx.Data, readings: Readings) -> mjx.Data:
+    """Returns the data with what ``readings`` returned."""
+    if not readings:
         return data
-    return with_fields(data.replace(sensordata=sensed["sensordata"]), **sensed["fields"])
+    return with_fields(data.replace(sensordata=readings["sensordata"]), **readings["fields"])
 
 
 def _like(computed: mjx.Data, data: mjx.Data) -> mjx.Data:

@@ -186,7 +186,7 @@ def runge_kutta_4(
     start = data
     timestep = model.opt.timestep
 
-    def follow(carry: tuple, row: jax.Array) -> tuple[tuple, sensors.Shown]:
+    def follow(carry: tuple, row: jax.Array) -> tuple[tuple, sensors.Readings]:
         """Evaluates a stage, adds its weighted rates, and moves from the start to the next."""
         stage, rate, sums = carry
         position, weight, next_position = row
@@ -197,7 +197,7 @@ def runge_kutta_4(
         # 1.7). What stops before the minimum has to start there.
         if not early_stop.stops_early(model):
             stage = stage.replace(qacc_warmstart=stage.qacc)
-        shown = sensors.shown(model, stage)
+        readings = sensors.readings(model, stage)
         # Rates are averaged where they add up: of one rotation vector since the start of the step,
         # not of velocities in the stages' frames, which MJX averages.
         rate = _displacement_rate(model, stage.qvel, rate, position)
@@ -213,14 +213,14 @@ def runge_kutta_4(
             act=start.act + act_dot * timestep,
             time=start.time + next_position * timestep,
         )
-        return (stage, rate, sums), shown
+        return (stage, rate, sums), readings
 
     # A loop, so that XLA compiles one forward pass instead of four.
     zero_sums = jax.tree.map(jnp.zeros_like, (data.qvel, data.qvel, data.act))
     rows = jnp.asarray(_STAGES, data.qpos.dtype)
-    (stage, _, sums), shown = jax.lax.scan(follow, (data, data.qvel, zero_sums), rows)
+    (stage, _, sums), readings = jax.lax.scan(follow, (data, data.qvel, zero_sums), rows)
     # In C the sensors show the first stage.
-    stage = sensors.with_shown(stage, jax.tree.map(lambda stages: stages[0], shown))
+    stage = sensors.with_readings(stage, jax.tree.map(lambda stages: stages[0], readings))
     end = stage.replace(qpos=start.qpos, qvel=start.qvel, act=start.act, time=start.time)
     qvel, qacc, act_dot = sums
     # The next step starts its solver at the last stage's acceleration, and shows the mean.

@@ -31,7 +31,7 @@ _UNROLLABLE = 6
 _BATCH = 8
 
 
-def solve_touching(solver: Solver, rarely: Solver, model: mjx.Model, data: mjx.Data) -> Solution:
+def solve_touching(solver: Solver, fallback: Solver, model: mjx.Model, data: mjx.Data) -> Solution:
     """Solves with the contacts that touch, or with all where more touch than there is room for.
 
     Where those that there is room for have more than half of the rows, it is not worth the branches
@@ -39,7 +39,7 @@ def solve_touching(solver: Solver, rarely: Solver, model: mjx.Model, data: mjx.D
 
     Args:
       solver: what solves; it takes fewer contacts than the model has.
-      rarely: what solves where there is no room, which should be little code.
+      fallback: what solves where there is no room, which should be little code.
       model: an MJX model.
       data: with its constraint rows made.
     """
@@ -51,7 +51,7 @@ def solve_touching(solver: Solver, rarely: Solver, model: mjx.Model, data: mjx.D
     num_saved = sum(_rows_of_one(contact, kind) * max(0, kind.size - room) for kind in kinds)
     if 2 * num_saved < num_rows or not is_written_out():
         return solver(model, data)
-    return _with_few(solver, rarely, model, data, kinds, room)
+    return _with_few(solver, fallback, model, data, kinds, room)
 
 
 def _room(model: mjx.Model) -> int:
@@ -65,7 +65,7 @@ def _room(model: mjx.Model) -> int:
 
 def _with_few(
     solver: Solver,
-    rarely: Solver,
+    fallback: Solver,
     model: mjx.Model,
     data: mjx.Data,
     kinds: list[np.ndarray],
@@ -96,7 +96,7 @@ def _with_few(
 
     def solve_all() -> Solution:
         with writing_out():
-            return rarely(model, make_constraint(model, data))
+            return fallback(model, make_constraint(model, data))
 
     # Packed before the branch, which needs the counts.
     packed_contacts = []
