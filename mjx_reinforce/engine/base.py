@@ -28,8 +28,9 @@ class Arrays:
     """A frozen dataclass of arrays, or of pytrees of them, that is a pytree in field order."""
 
     def __init_subclass__(cls) -> None:
-        made: Any = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
-        fields = dataclasses.fields(made)
+        # In place: the decorator returns the class itself, of which a type checker sees no fields.
+        decorated: Any = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+        fields = dataclasses.fields(decorated)
         jax.tree_util.register_dataclass(cls, [field.name for field in fields], [])
 
     def replace(self, **changes: Any) -> Self:
@@ -128,7 +129,7 @@ class Acts(Protocol):
 
 
 #: The fields of a trajectory that have an entry for each step, [T, N, ...].
-_OF_STEPS = ("observation", "action", "reward", "mask")
+_STEP_FIELDS = ("observation", "action", "reward", "mask")
 
 
 class Trajectory(Arrays):
@@ -163,25 +164,27 @@ class Trajectory(Arrays):
     simulated: jax.Array
 
     def __repr__(self) -> str:
-        named = {"observation": self.observation, "action": self.action, "mask": self.mask}
-        shapes = (f"{name} {x.dtype}{list(x.shape)}" for name, x in named.items())
+        # Shapes say what it is; the arrays would be pages of numbers.
+        arrays = {"observation": self.observation, "action": self.action, "mask": self.mask}
+        shapes = (f"{name} {x.dtype}{list(x.shape)}" for name, x in arrays.items())
         return f"Trajectory({', '.join(shapes)})"
 
     def first(self, steps: int) -> "Trajectory":
         """Returns the first so many steps of every episode."""
-        return self.replace(**{name: getattr(self, name)[:steps] for name in _OF_STEPS})
+        return self.replace(**{name: getattr(self, name)[:steps] for name in _STEP_FIELDS})
 
     def episodes(self, part: slice) -> "Trajectory":
         """Returns a part of the episodes; ``simulated`` remains that of all."""
-        of_steps = {name: getattr(self, name)[:, part] for name in _OF_STEPS}
-        return self.replace(**of_steps, nonfinite=self.nonfinite[part])
+        # Time is the first axis of these, episodes the second.
+        step_fields = {name: getattr(self, name)[:, part] for name in _STEP_FIELDS}
+        return self.replace(**step_fields, nonfinite=self.nonfinite[part])
 
 
 def action_space(env: Environment) -> Box | Discrete:
     """Returns the actions an environment declares, or brax's convention of [-1, 1]."""
-    declared = getattr(env, "action_space", None)
-    if isinstance(declared, Box | Discrete):
-        return declared
+    space = getattr(env, "action_space", None)
+    if isinstance(space, Box | Discrete):
+        return space
     return Box(np.full(env.action_size, -1.0), np.full(env.action_size, 1.0))
 
 

@@ -32,10 +32,12 @@ class Cache(NamedTuple):
         traced.
         """
         folder = objects.folder()
-        looks = any(jax.config.values[name] for name in ("jax_debug_nans", "jax_debug_infs"))
-        if looks or objects.is_described() or platform() not in ("cpu", "gpu"):
+        has_checks = any(jax.config.values[name] for name in ("jax_debug_nans", "jax_debug_infs"))
+        if has_checks or objects.is_described() or platform() not in ("cpu", "gpu"):
             return None
-        return None if folder is None else cls(folder)
+        if folder is None:
+            return None
+        return cls(folder)
 
     def made_by(self, *packages: str) -> dict[str, Any]:
         """Returns what programs depend on: sources of packages, the machine, what JAX is told."""
@@ -64,13 +66,15 @@ class Cache(NamedTuple):
           program: a function of arrays that returns lists, tuples and dicts of arrays.
           given: its arguments, or their shapes.
         """
+        # JAX exports no custom call unless it knows that the target stays what it is. Ours is
+        # machine code that is kept beside the program, and ``load`` brings it back.
         names = (*seam.targets(), *gpu_seam.targets())
         unsafe = [export.DisabledSafetyCheck.custom_call(x) for x in names]
         try:
             exported = export.export(jax.jit(program), disabled_checks=unsafe)(*given)
             # That list names all code in memory, also of other tasks; ``load`` would ask for it.
-            own = dataclasses.replace(exported, disabled_safety_checks=())
-            content = bytes(own.serialize())
+            exported = dataclasses.replace(exported, disabled_safety_checks=())
+            content = bytes(exported.serialize())
         except (ValueError, NotImplementedError):
             return program
         self.write(name, content)
@@ -85,4 +89,4 @@ class Cache(NamedTuple):
 
 
 def _program(content: bytes) -> Callable[..., Any]:
-    return lambda *given: export.deserialize(bytearray(content)).call(*given)
+    return lambda *arguments: export.deserialize(bytearray(content)).call(*arguments)

@@ -13,29 +13,36 @@ import types
 import typing
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-_HERE = Path(__file__).resolve().parents[1]
+_PACKAGE = Path(__file__).resolve().parents[1]
+_PYTHON = (Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib"))
 #: Code that no user wrote: Python's, installed packages, and ours.
-_LIBRARIES = (
-    *(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "purelib", "platlib")),
-    *(_HERE, (_HERE / "envs").resolve()),
-)
+_LIBRARIES = [path.resolve() for path in (*_PYTHON, _PACKAGE, _PACKAGE / "envs")]
 #: Characters of somebody else's message that are shown.
-_LENGTH = 300
+_MAX_MESSAGE = 300
 #: How alike names are, as ``difflib`` counts, of which a third of the letters differ.
 _ALIKE = 0.66
 #: What every environment has.
-_PARTS = ("reset", "step", "action_size")
-_KINDS: dict[Any, tuple[Any, str]] = {
-    bool: (bool, "True or False"),
-    int: (numbers.Integral, "a whole number"),
-    float: (numbers.Real, "a number"),
-    str: (str, "text"),
-    type(None): (type(None), "None"),
+_MEMBERS = ("reset", "step", "action_size")
+
+
+class _Kind(NamedTuple):
+    """A kind of value: its class, and what messages call it."""
+
+    type: Any
+    words: str
+
+
+_KINDS: dict[Any, _Kind] = {
+    bool: _Kind(bool, "True or False"),
+    int: _Kind(numbers.Integral, "a whole number"),
+    float: _Kind(numbers.Real, "a number"),
+    str: _Kind(str, "text"),
+    type(None): _Kind(type(None), "None"),
 }
 #: How people write the values of kinds that have few.
 _WORDS: dict[Any, dict[str, Any]] = {
@@ -60,14 +67,19 @@ def explain(error: BaseException) -> str:
     The messages of JAX and MuJoCo have many lines, of which the first ones say what is wrong.
     """
     message = " ".join(str(error).split())
-    message = message if len(message) <= _LENGTH else f"{message[:_LENGTH]} ..."
-    said = f"{type(error).__name__}: {message}" if message else type(error).__name__
-    own = ""
+    if len(message) > _MAX_MESSAGE:
+        message = f"{message[:_MAX_MESSAGE]} ..."
+    summary = type(error).__name__
+    if message:
+        summary = f"{summary}: {message}"
+    # Frames go from the outermost to where it was raised: the user's last one is the nearest.
+    user_line = ""
     for frame in traceback.extract_tb(error.__traceback__):
         file = Path(frame.filename).resolve()
+        # Code without a file, such as what dataclasses write, is "<string>".
         if not frame.filename.startswith("<") and not any(map(file.is_relative_to, _LIBRARIES)):
-            own = f" ({file.name}, line {frame.lineno})"
-    return said + own
+            user_line = f" ({file.name}, line {frame.lineno})"
+    return summary + user_line
 
 
 def check_type(name: str, value: object, kind: object) -> None:
@@ -85,40 +97,55 @@ def check_type(name: str, value: object, kind: object) -> None:
 
 def fits(value: object, kind: object) -> bool:
     """Returns whether a value is of an annotation, see ``check_type``."""
-    if len(kinds := alternatives(kind)) > 1:
-        return any(fits(value, each) for each in kinds)
-    origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    kinds = alternatives(kind)
+    if len(kinds) > 1:
+        return any(fits(value, member) for member in kinds)
+    origin = typing.get_origin(kind)
+    arguments = typing.get_args(kind)
     if origin is typing.Literal:
-        return any(type(value) is type(each) and value == each for each in inner)
+        # By type too, since 1 == True == 1.0.
+        return any(type(value) is type(literal) and value == literal for literal in arguments)
     if origin is tuple:
-        if not isinstance(value, tuple | list):
-            return False
-        kinds = inner[:1] * len(value) if inner[-1] is ... else inner
-        return len(kinds) == len(value) and all(map(fits, value, kinds))
+        return _fits_tuple(value, arguments)
+    # Python's bool is an int; a setting that is a number is not to be True.
     if kind in (int, float) and isinstance(value, bool):
         return False
-    expected = _KINDS[kind][0] if kind in _KINDS else kind
-    return isinstance(value, expected) if isinstance(expected, type) else True
+    expected = _KINDS[kind].type if kind in _KINDS else kind
+    return not isinstance(expected, type) or isinstance(value, expected)
+
+
+def _fits_tuple(value: object, arguments: tuple[Any, ...]) -> bool:
+    """Returns whether a value is a tuple of these kinds, or, as in TOML and JSON, a list."""
+    if not isinstance(value, tuple | list):
+        return False
+    if arguments[-1] is ...:
+        arguments = arguments[:1] * len(value)
+    return len(arguments) == len(value) and all(map(fits, value, arguments))
 
 
 def alternatives(kind: object) -> tuple[Any, ...]:
-    """Returns the annotations of a union, or the one that is given."""
-    union = typing.get_origin(kind) in (typing.Union, types.UnionType)
-    return typing.get_args(kind) if union else (kind,)
+    """Returns the annotations of a union, or of what is no union the annotation alone."""
+    if typing.get_origin(kind) in (typing.Union, types.UnionType):
+        return typing.get_args(kind)
+    return (kind,)
 
 
 def spoken_kind(kind: object) -> str:
     """Returns an annotation in words."""
-    if len(kinds := alternatives(kind)) > 1:
+    kinds = alternatives(kind)
+    if len(kinds) > 1:
         return " or ".join(map(spoken_kind, kinds))
-    origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    origin = typing.get_origin(kind)
+    arguments = typing.get_args(kind)
     if origin is typing.Literal:
-        return f"one of {', '.join(map(repr, inner))}"
-    if origin is tuple and inner[-1] is ...:
-        return f"a tuple, each entry {spoken_kind(inner[0])}"
+        return f"one of {', '.join(map(repr, arguments))}"
+    if origin is tuple and arguments[-1] is ...:
+        return f"a tuple, each entry {spoken_kind(arguments[0])}"
     if origin is tuple:
-        return f"({', '.join(map(spoken_kind, inner))})"
-    return _KINDS[kind][1] if kind in _KINDS else getattr(kind, "__name__", str(kind))
+        return f"({', '.join(map(spoken_kind, arguments))})"
+    if kind in _KINDS:
+        return _KINDS[kind].words
+    return getattr(kind, "__name__", str(kind))
 
 
 def read_as(kind: Any, word: str) -> Any:
@@ -127,23 +154,29 @@ def read_as(kind: Any, word: str) -> Any:
     Raises:
       ValueError: it is none.
     """
-    if len(kinds := alternatives(kind)) > 1:
-        for each in kinds:
+    kinds = alternatives(kind)
+    if len(kinds) > 1:
+        for member in kinds:
             with contextlib.suppress(ValueError):
-                return read_as(each, word)
+                return read_as(member, word)
         raise ValueError(word)
     if typing.get_origin(kind) is tuple:
-        inner = typing.get_args(kind)[0]
-        return tuple(read_as(inner, part) for part in word.split(",")) if word != "none" else ()
+        entry_kind = typing.get_args(kind)[0]
+        if word == "none":  # how a command line writes an empty tuple
+            return ()
+        return tuple(read_as(entry_kind, entry) for entry in word.split(","))
+    if kind is int:
+        return whole_number(word)
     if typing.get_origin(kind) is typing.Literal:
-        words = {name: name for name in typing.get_args(kind)}
+        values = {name: name for name in typing.get_args(kind)}
     elif kind in _WORDS:
-        words, word = _WORDS[kind], word.lower()
+        values = _WORDS[kind]
+        word = word.lower()
     else:
-        return whole_number(word) if kind is int else kind(word)
-    if word not in words:
+        return kind(word)
+    if word not in values:
         raise ValueError(word)
-    return words[word]
+    return values[word]
 
 
 def check_kind(name: str, value: object, kind: type, example: str) -> None:
@@ -155,20 +188,28 @@ def check_kind(name: str, value: object, kind: type, example: str) -> None:
       kind: the class.
       example: what to write instead.
     """
-    if not isinstance(value, kind):
-        what = getattr(value, "__name__", repr(value) if isinstance(value, str) else None)
-        got = what or f"a {type(value).__name__}"
-        raise ValueError(f"{name} must be of type {kind.__name__}, such as {example}, got {got}")
+    if isinstance(value, kind):
+        return
+    # A class or function by its name, a text as it is, anything else by its type.
+    description = getattr(value, "__name__", "")
+    if isinstance(value, str):
+        description = description or repr(value)
+    description = description or f"a {type(value).__name__}"
+    raise ValueError(
+        f"{name} must be of type {kind.__name__}, such as {example}, got {description}"
+    )
 
 
 def changed_fields(settings: "DataclassInstance") -> str:
     """Returns the fields of a dataclass that have other values than their defaults, as code."""
-    given = (
-        f"{field.name}={value!r}"
-        for field in dataclasses.fields(settings)
-        if field.init and (value := getattr(settings, field.name)) != field.default
-    )
-    return ", ".join(given)
+    arguments = []
+    for field in dataclasses.fields(settings):
+        if not field.init:
+            continue
+        value = getattr(settings, field.name)
+        if value != field.default:
+            arguments.append(f"{field.name}={value!r}")
+    return ", ".join(arguments)
 
 
 def whole_number(text: str) -> int:
@@ -181,6 +222,7 @@ def whole_number(text: str) -> int:
         number = decimal.Decimal(text)
     except decimal.InvalidOperation:
         number = decimal.Decimal("nan")
+    # Its size before its value: int would write out all the digits of 1e999999999.
     if not number.is_finite() or number.adjusted() >= 100 or number != int(number):
         raise ValueError(f"takes a whole number, such as 4 or 2e6, got {text!r}")
     return int(number)
@@ -197,7 +239,7 @@ def check_parts(env: object) -> None:
     if isinstance(env, type):
         raise BadEnvironmentError(f"{env.__name__} is a class, not an environment yet: call it")
     try:
-        missing = [part for part in _PARTS if not hasattr(env, part)]
+        missing = [member for member in _MEMBERS if not hasattr(env, member)]
     except Exception as error:  # action_size may be a property, the user's code
         raise BadEnvironmentError(f"{name}.action_size fails: {explain(error)}") from error
     lacks = f"{name} is not an environment: it has no {', '.join(missing)}"
@@ -210,8 +252,10 @@ def known_number(value: Any) -> float | None:
 
     if isinstance(value, jax.core.Tracer):
         return None
+    if isinstance(value, bool | str):  # of both, float would make numbers
+        return math.nan
     try:
-        return math.nan if isinstance(value, bool | str) else float(value)
+        return float(value)
     except (TypeError, ValueError):
         return math.nan
 
@@ -221,10 +265,14 @@ def check_number(name: str, value: object, *, positive: bool = False, finite: bo
     number = known_number(value)
     if number is None:
         return
-    allowed = number > 0 if positive else number >= 0
-    if not allowed or (finite and math.isinf(number)):
-        kind = "positive" if positive else "0 or more"
-        raise ValueError(f"{name} must be {kind}{' and finite' * finite}, got {value!r}")
+    # Comparisons with NaN are False: it is not allowed.
+    is_allowed = number > 0 if positive else number >= 0
+    if is_allowed and not (finite and math.isinf(number)):
+        return
+    kind = "positive" if positive else "0 or more"
+    if finite:
+        kind = f"{kind} and finite"
+    raise ValueError(f"{name} must be {kind}, got {value!r}")
 
 
 def check_count(name: str, value: int, least: int = 1) -> None:
@@ -244,35 +292,42 @@ def check_key(key: object) -> None:
         raise ValueError(f"the key must be a random key, such as jax.random.key(0), got {key!r}")
 
 
-def check_name(kind: str, name: str, known: Mapping[str, Any]) -> None:
-    """Raises ValueError for a name that is not known, with the known ones and the nearest.
+def check_name(kind: str, name: str, table: Mapping[str, Any]) -> None:
+    """Raises ValueError for a name that is not in a table, with its names and the nearest of them.
 
     Args:
       kind: what is named, for the message.
       name: what the user typed.
-      known: the table.
+      table: has the names.
     """
-    if name in known:
+    if name in table:
         return
-    near = nearest(name, known)
+    near = nearest(name, table)
     hint = f" Did you mean {near!r}?" if near else ""
-    raise ValueError(f"unknown {kind} {name!r}.{hint} Known: {', '.join(sorted(known))}.")
+    raise ValueError(f"unknown {kind} {name!r}.{hint} Known: {', '.join(sorted(table))}.")
 
 
-def nearest(name: str, known: Iterable[str]) -> str | None:
-    """Returns the known name that somebody meant, whatever the case of the letters, if any is near.
+def nearest(name: str, names: Iterable[str]) -> str | None:
+    """Returns the name that somebody meant, whatever the case of the letters, if any is near.
 
     Args:
-      name: what the user typed; a known name that contains it is near. A version, such as -v5,
-        makes no two names alike.
-      known: the names; of versions of one name the last is meant, unless the user typed another.
+      name: what the user typed; a name that contains it is near. A version, such as -v5, makes no
+        two names alike.
+      names: of versions of one name the last is meant, unless the user typed another.
     """
-    typed, versions = _plain(name), {}
-    for each in sorted(known):
-        versions.setdefault(_plain(each), []).append(each)
-    inside = [each for each in versions if len(typed) > 2 and typed in each]
-    near = difflib.get_close_matches(typed, inside or versions, n=1, cutoff=0 if inside else _ALIKE)
-    return difflib.get_close_matches(name, versions[near[0]], n=1, cutoff=0)[0] if near else None
+    typed = _plain(name)
+    versions: dict[str, list[str]] = {}
+    for candidate in sorted(names):
+        versions.setdefault(_plain(candidate), []).append(candidate)
+    # Of names that hold what was typed the most alike is meant, however much longer it is.
+    containing = [plain_name for plain_name in versions if len(typed) > 2 and typed in plain_name]
+    if containing:
+        matches = difflib.get_close_matches(typed, containing, n=1, cutoff=0)
+    else:
+        matches = difflib.get_close_matches(typed, versions, n=1, cutoff=_ALIKE)
+    if not matches:
+        return None
+    return difflib.get_close_matches(name, versions[matches[0]], n=1, cutoff=0)[0]
 
 
 def _plain(name: str) -> str:

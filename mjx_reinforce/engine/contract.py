@@ -61,60 +61,69 @@ def _check_wrappers(env: object) -> None:
 
 def _check_limits(name: str, env: object) -> None:
     """Raises ValueError for a time limit or threshold that is none."""
-    limit, threshold = (_declared(name, env, x) for x in ("max_episode_steps", "reward_threshold"))
+    # Both are read before either is checked: reading one may raise the user's own error.
+    limit = _attribute(name, env, "max_episode_steps")
+    threshold = _attribute(name, env, "reward_threshold")
     if limit is not None:
         _require_count(f"{name}.max_episode_steps", limit)
     is_number = isinstance(threshold, numbers.Real) and not checks.is_nan(threshold)
-    said = f"{name}.reward_threshold must be a number or None, got {threshold!r}"
-    require(threshold is None or is_number, said)
+    require(
+        threshold is None or is_number,
+        f"{name}.reward_threshold must be a number or None, got {threshold!r}",
+    )
 
 
 def _check_action_space(name: str, env: Environment) -> None:
     """Raises ValueError for actions that cannot be drawn."""
-    size, declared = env.action_size, _declared(name, env, "action_space")
+    size = env.action_size
+    space = _attribute(name, env, "action_space")
     _require_count(f"{name}.action_size", size)
-    if isinstance(declared, Discrete):
-        count = f"{declared.num_actions} actions"
-        said = f"{name}.action_size is {size}, but its action_space has {count}"
-        require(declared.num_actions == size, said)
-    elif isinstance(declared, Box):
+    if isinstance(space, Discrete):
         require(
-            _are_bounds(declared, size),
+            space.num_actions == size,
+            f"{name}.action_size is {size}, but its action_space has {space.num_actions} actions",
+        )
+    elif isinstance(space, Box):
+        require(
+            _are_bounds(space, size),
             f"{name}.action_space must have low < high, of {size} entries each as action_size "
-            f"says, got low {declared.low} and high {declared.high}",
+            f"says, got low {space.low} and high {space.high}",
         )
     else:
+        # A space of Gymnasium has the same name and other fields: the message says whose it is.
         require(
-            declared is None,
-            f"{name}.action_space is a {type(declared).__module__}.{type(declared).__name__}; "
+            space is None,
+            f"{name}.action_space is a {type(space).__module__}.{type(space).__name__}; "
             "make it a mjx_reinforce.Box(low, high) or mjx_reinforce.Discrete(num_actions)",
         )
 
 
-def _declared(name: str, env: object, what: str) -> Any:
+def _attribute(name: str, env: object, attribute: str) -> Any:
     """Returns what an environment says of itself, None if it says nothing."""
     try:
-        return getattr(env, what, None)
+        return getattr(env, attribute, None)
     except Exception as error:  # it may be a property, the user's code
-        raise BadEnvironmentError(f"{name}.{what} fails: {checks.explain(error)}") from error
+        raise BadEnvironmentError(f"{name}.{attribute} fails: {checks.explain(error)}") from error
 
 
 def _require_count(name: str, value: Any) -> None:
     """Raises ValueError for what is no whole number, 1 or more; True is none."""
-    whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
-    require(whole and int(value) >= 1, f"{name} must be a whole number, 1 or more, got {value!r}")
+    is_whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    is_count = is_whole and int(value) >= 1
+    require(is_count, f"{name} must be a whole number, 1 or more, got {value!r}")
 
 
 def _are_bounds(space: Box, size: int) -> bool:
     """Returns whether a space has two vectors of numbers [size], the lower one below the other."""
     try:
-        low, high = np.asarray(space.low, float), np.asarray(space.high, float)
+        low = np.asarray(space.low, float)
+        high = np.asarray(space.high, float)
     except (TypeError, ValueError):
         return False
     return low.shape == high.shape == (size,) and bool(np.all(low < high))
 
 
-def _shapes(name: str, what: str, function: Callable[..., Any], *arguments: PyTree) -> Any:
+def _shapes(name: str, method: str, function: Callable[..., Any], *arguments: PyTree) -> Any:
     """Returns the shapes of what a method returns."""
     try:
         return shapes(function, *arguments)
@@ -123,7 +132,7 @@ def _shapes(name: str, what: str, function: Callable[..., Any], *arguments: PyTr
     except (Exception, SystemExit) as error:  # it is the user's code, which may raise anything
         remedy = _TRACED if isinstance(error, _NEED_VALUES) else ""
         raise BadEnvironmentError(
-            f"{name}.{what} fails: {checks.explain(error)}{remedy}"
+            f"{name}.{method} fails: {checks.explain(error)}{remedy}"
         ) from error
 
 
@@ -141,28 +150,37 @@ def _check_state(name: str, start: PyTree) -> None:
         ("done", 0, "a scalar []", "reduce it, as with jnp.any"),
     ):
         value = getattr(start, field, None)
-        got = f"there is no {field}" if value is None else f"it is {described(value)}"
-        said = f"{name}.reset must return a state whose {field} is {shape}, and {got}; "
-        require(hasattr(value, "shape"), f"{said}brax.envs.State has all that is needed")
+        fault = f"there is no {field}" if value is None else f"it is {described(value)}"
+        require(
+            hasattr(value, "shape"),
+            f"{name}.reset must return a state whose {field} is {shape}, and {fault}; "
+            "brax.envs.State has all that is needed",
+        )
         array: Any = value
-        the_field, found = f"the {field} of {name}.reset must", list(array.shape)
-        said = f"{the_field} be {shape}, its shape is {found}; {remedy}"
-        require(len(found) == axes and 0 not in found, said)
-        said = f"{the_field} hold real numbers, it holds {array.dtype}"
-        require(jnp.isrealobj(array), said)
+        sizes = list(array.shape)
+        # An axis without entries would give a policy nothing to see.
+        require(
+            len(sizes) == axes and 0 not in sizes,
+            f"the {field} of {name}.reset must be {shape}, its shape is {sizes}; {remedy}",
+        )
+        require(
+            jnp.isrealobj(array),
+            f"the {field} of {name}.reset must hold real numbers, it holds {array.dtype}",
+        )
 
 
 def _check_same(name: str, start: PyTree, after: PyTree) -> None:
     """Raises ValueError if ``step`` returns a state of another kind than ``reset``."""
-    before, now = _paths(start), _paths(after)
-    only = [f"{path} only after reset" for path in before if path not in now]
-    only += [f"{path} only after step" for path in now if path not in before]
-    require(
-        jax.tree.structure(start) == jax.tree.structure(after),
-        f"{name}.step must return a state with the entries that reset's has"
-        f"{': ' if only else ''}{', '.join(only[:4])}",
-    )
-    for (path, old), new in zip(before.items(), now.values(), strict=True):
+    reset_leaves = _paths(start)
+    step_leaves = _paths(after)
+    unpaired = [f"{path} only after reset" for path in reset_leaves if path not in step_leaves]
+    unpaired += [f"{path} only after step" for path in step_leaves if path not in reset_leaves]
+    # Trees of the same leaves may still differ, as a tuple and a list do.
+    message = f"{name}.step must return a state with the entries that reset's has"
+    if unpaired:
+        message = f"{message}: {', '.join(unpaired[:4])}"
+    require(jax.tree.structure(start) == jax.tree.structure(after), message)
+    for (path, old), new in zip(reset_leaves.items(), step_leaves.values(), strict=True):
         # May a new value be kept in place of an old one, as ``hold`` does?
         holds = old.dtype == new.dtype or jnp.promote_types(old.dtype, new.dtype) == old.dtype
         require(
@@ -203,16 +221,20 @@ def check_policy(
             "distribution must have the functions noise, sample and mode, as "
             f"learner.policy.distribution has, got {distribution!r}"
         )
-    found = jax.eval_shape(act, params, observation).shape
-    of_network = getattr(distribution, "num_outputs", None)
-    constants = len(getattr(distribution, "constants", ()))
-    if of_network is not None and found != (of_network + constants,):
-        behind = f", and behind them {constants} that no observation changes" if constants else ""
-        raise ValueError(
-            f"act must return [{of_network + constants}] outputs of one observation: {of_network} "
-            f"that a network computes{behind} (they start at distribution.constants); it returns "
-            f"the shape {list(found)}"
-        )
+    shape = jax.eval_shape(act, params, observation).shape
+    # A family need not say how long its outputs are; then any length may be right.
+    num_outputs = getattr(distribution, "num_outputs", None)
+    num_constants = len(getattr(distribution, "constants", ()))
+    if num_outputs is None or shape == (num_outputs + num_constants,):
+        return
+    constants = ""
+    if num_constants:
+        constants = f", and behind them {num_constants} that no observation changes"
+    raise ValueError(
+        f"act must return [{num_outputs + num_constants}] outputs of one observation: "
+        f"{num_outputs} that a network computes{constants} (they start at "
+        f"distribution.constants); it returns the shape {list(shape)}"
+    )
 
 
 def check_shape(name: str, value: object, *shapes: tuple[int, ...], remedy: str = "") -> None:
@@ -241,4 +263,6 @@ def in_words(value: object) -> str:
     if isinstance(value, tuple | list):
         return f"a {type(value).__name__} of {len(value)}"
     shape = shape_of(value)
-    return f"{value!r}"[:80] if shape is None else f"the shape {list(shape)}"
+    if shape is None:
+        return f"{value!r}"[:80]
+    return f"the shape {list(shape)}"

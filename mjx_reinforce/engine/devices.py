@@ -15,7 +15,9 @@ _AXIS = "devices"
 #: differ from run to run. On an H100 Humanoid compiled in 9 s without trials, in 51 s with them.
 _ON_GPU = {"xla_gpu_enable_triton_gemm": False, "xla_gpu_autotune_level": 0}
 #: The first axis is divided among the devices, such as that of the runs; the second is; none is.
-RUNS, SECOND, NONE = PartitionSpec(_AXIS), PartitionSpec(None, _AXIS), PartitionSpec()
+RUNS = PartitionSpec(_AXIS)
+SECOND = PartitionSpec(None, _AXIS)
+NONE = PartitionSpec()
 
 
 def memory_here() -> float:
@@ -28,10 +30,11 @@ def memory_here() -> float:
 
 def check_room(needed: float) -> None:
     """Raises ValueError if so many bytes are not there."""
-    if needed > (here := memory_here()):
+    memory = memory_here()
+    if needed > memory:
         raise ValueError(
             f"this does not fit into memory: it needs about {gigabytes(needed)}, "
-            f"{gigabytes(here)} are here; lower --num-seeds (of a sweep --chunk-runs), "
+            f"{gigabytes(memory)} are here; lower --num-seeds (of a sweep --chunk-runs), "
             "--num-episodes, --eval-episodes, --hidden-sizes, --value-hidden-sizes or --horizon"
         )
 

@@ -72,9 +72,10 @@ def episode_keys(key: jax.Array, num_episodes: int) -> jax.Array:
     Raises:
       ValueError: the keys are of another number.
     """
-    several = jax.random.key_data(key)[..., 0]
-    check_each(num_episodes, key=several)
-    if several.ndim:
+    # A key's data has an axis more than the key: its first word has the shape of the keys.
+    words = jax.random.key_data(key)[..., 0]
+    check_each(num_episodes, key=words)
+    if words.ndim:
         return key
     return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(num_episodes))
 
@@ -113,12 +114,15 @@ def step(
       alive: [] or [N] whether the episode is still running.
       deterministic: [] or [N] whether the action is the mode instead; by default it never is.
     """
+    # N is the last axis of the state and the first of what the policy reads: hence ``.T``, which
+    # leaves the vector of one episode as it is.
     observation = jnp.where(alive, state.obs, 0.0)
     outputs = act(actor, observation.T)
     action = distribution.sample(outputs, noise)
     if deterministic is not None:
         action = _choose(deterministic, distribution.mode(outputs), action)
     after = env_step(state, action.T)
+    # An episode that is over is stepped too, by an action that nobody sees: it cannot break.
     finite = jnp.all(jnp.isfinite(after.obs), axis=0)
     finite &= jnp.isfinite(after.reward) & jnp.isfinite(after.done)
     broken = alive & ~finite
@@ -192,7 +196,10 @@ def play_chunks(
     draw = jax.vmap(functools.partial(draw_noise, distribution, length), out_axes=(0, 1))
 
     def advance(carry):
+        """Plays one chunk, and writes its records where they belong."""
         chunk, keys, progress, records = carry
+        # Noise for all lanes and the whole chunk, also of episodes that end in it: an episode's
+        # keys depend on nothing but how many chunks were played.
         keys, noise = draw(keys)
         progress, new = play(noise, progress)
         records = jax.tree.map(
@@ -204,6 +211,7 @@ def play_chunks(
         chunk, _, progress, _ = carry
         return (chunk < horizon // length) & jnp.any(progress.alive != 0)
 
+    # The length divides the horizon, so that no chunk is written over the end of the records.
     init = (jnp.zeros((), jnp.int32), keys, progress, records)
     chunks, _, progress, records = while_any(unfinished, advance, init)
     return progress, records, chunks * length * progress.alive.size

@@ -32,8 +32,9 @@ def key_of(*parts: object) -> str:
     import llvmlite
     import llvmlite.binding as llvm
 
-    made_by = "1", llvmlite.__version__, llvm.llvm_version_info
-    return hashlib.sha256("\n".join(map(str, (*made_by, *parts))).encode()).hexdigest()
+    # The first part is the version of these keys: another one makes every object anew.
+    compiler = "1", llvmlite.__version__, llvm.llvm_version_info
+    return hashlib.sha256("\n".join(map(str, (*compiler, *parts))).encode()).hexdigest()
 
 
 def read_object(folder: Path, key: str) -> bytes | None:
@@ -47,14 +48,20 @@ def read_object(folder: Path, key: str) -> bytes | None:
             data = file.read()
     except OSError:
         return None
-    with contextlib.suppress(OSError):  # it can only be read
+    # The time of its last use, by which ``_forget`` goes. A folder may be readable only.
+    with contextlib.suppress(OSError):
         os.utime(path)
-    whole = hashlib.sha256(data[_DIGEST:]).digest() == data[:_DIGEST]
-    return data[_DIGEST:] if whole else None
+    digest = data[:_DIGEST]
+    content = data[_DIGEST:]
+    if hashlib.sha256(content).digest() != digest:
+        return None
+    return content
 
 
 def write_object(folder: Path, key: str, data: bytes, limit: int = LIMIT) -> None:
     """Keeps an object and forgets the oldest; a folder that cannot be written keeps nothing."""
+    # Into a file of another name, which then replaces the object at once: whoever reads meanwhile,
+    # or is there after a kill, finds the old one or the new one, whole.
     with contextlib.suppress(OSError):
         make_folder(folder)
         handle, name = tempfile.mkstemp(dir=folder, suffix=".o")
@@ -75,12 +82,12 @@ def _open_no_link(path: str, flags: int) -> int:
 
 def _forget(folder: Path, limit: int) -> None:
     """Removes what was used longest ago until no more than ``limit`` bytes are left."""
-    found = []
+    files = []
     for path in folder.glob("*.o"):
         with contextlib.suppress(OSError):  # another process removed it
-            found.append((path.stat().st_mtime_ns, path.stat().st_size, path))
-    total = sum(size for _, size, _ in found)
-    for _, size, path in sorted(found):
+            files.append((path.stat().st_mtime_ns, path.stat().st_size, path))
+    total = sum(size for _, size, _ in files)
+    for _, size, path in sorted(files):
         if total <= limit:
             return
         with contextlib.suppress(OSError):
@@ -91,6 +98,7 @@ def _forget(folder: Path, limit: int) -> None:
 @functools.cache
 def source_digest(*packages: str) -> str:
     """Returns a hash of the files of packages that decide what is compiled."""
+    # In one order on every machine, so that the same sources have the same hash.
     digest = hashlib.sha256()
     for name in packages:
         with resources.as_file(resources.files(name)) as folder:
@@ -108,12 +116,15 @@ def folder() -> Path | None:
     """
     import jax  # here alone: commands that compute nothing do not wait for it
 
-    chosen = jax.config.values["jax_compilation_cache_dir"]
-    if not chosen or "://" in chosen or not jax.config.values["jax_enable_compilation_cache"]:
+    cache_dir = jax.config.values["jax_compilation_cache_dir"]
+    is_enabled = jax.config.values["jax_enable_compilation_cache"]
+    # JAX also takes a bucket, such as gs://..., where no file can be checked for its owner.
+    if not cache_dir or "://" in cache_dir or not is_enabled:
         return None
-    folder = Path(chosen) / "native"
-    if why := distrust(folder):
-        warnings.warn(f"{why}, so no machine code is kept in {folder}", stacklevel=2)
+    folder = Path(cache_dir) / "native"
+    reason = distrust(folder)
+    if reason:
+        warnings.warn(f"{reason}, so no machine code is kept in {folder}", stacklevel=2)
         return None
     return folder
 
@@ -138,8 +149,9 @@ def _stranger(place: Path, status: os.stat_result) -> str | None:
         return None
     if status.st_uid not in (0, os.geteuid()):
         return f"{place} belongs to another user ({status.st_uid})"
-    others = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    return f"others may write to {place}" if others else None
+    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        return f"others may write to {place}"
+    return None
 
 
 def make_folder(folder: Path) -> None:
@@ -148,6 +160,7 @@ def make_folder(folder: Path) -> None:
     Raises:
       OSError: it cannot be made, or is a file.
     """
+    # From the root down, each by itself: ``parents=True`` would make those above with all rights.
     for place in (*reversed(folder.parents), folder):
         if not place.is_dir():
             place.mkdir(0o700, exist_ok=True)
@@ -158,15 +171,17 @@ def is_described() -> bool:
     return os.environ.get(DEBUG, "0") not in ("", "0")
 
 
-def describe(key: str, what: str) -> None:
+def describe(key: str, description: str) -> None:
     """Says something of an object on stderr where that is asked for."""
     if is_described():
-        print(f"kernel {key}: {' '.join(what.split())}", file=sys.stderr, flush=True)
+        print(f"kernel {key}: {' '.join(description.split())}", file=sys.stderr, flush=True)
 
 
 def kept(key: str, folder: Path | None) -> bytes | None:
     """Returns an object that need not be made; None if there is none."""
-    return read_object(folder, key) if folder and not is_described() else None
+    if not folder or is_described():
+        return None
+    return read_object(folder, key)
 
 
 def make(key: str, folder: Path | None, text: str, compile: Callable[[str], bytes]) -> bytes:
@@ -178,14 +193,14 @@ def make(key: str, folder: Path | None, text: str, compile: Callable[[str], byte
       text: LLVM IR, whose first line says what it is.
       compile: returns what is kept.
     """
-    began = time.perf_counter()
-    made = compile(text)
-    seconds = time.perf_counter() - began
-    about = text.partition("\n")[0].removeprefix("; ")
-    describe(key, f"{about}; LLVM took {seconds:.2f} s for {len(made):,} bytes")
+    start = time.perf_counter()
+    content = compile(text)
+    seconds = time.perf_counter() - start
+    title = text.partition("\n")[0].removeprefix("; ")
+    describe(key, f"{title}; LLVM took {seconds:.2f} s for {len(content):,} bytes")
     if folder:
-        write_object(folder, key, made)
+        write_object(folder, key, content)
         if is_described():
             with contextlib.suppress(OSError):
                 (folder / f"{key}.ll").write_text(text, encoding="utf-8")
-    return made
+    return content

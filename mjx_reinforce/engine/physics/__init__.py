@@ -30,7 +30,10 @@ class _Finder(PathFinder):
     def find_spec(
         cls, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        spec = super().find_spec(fullname, path, target) if fullname == _WARP else None
+        """Returns how to load that module, by ``_Loader``; None for any other."""
+        if fullname != _WARP:
+            return None
+        spec = super().find_spec(fullname, path, target)
         if spec is not None and spec.origin is not None:
             spec.loader = _Loader(fullname, spec.origin)
         return spec

@@ -25,13 +25,13 @@ _ZERO = {
 _CORNERS = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
 
 
-def _chosen(which: jax.Array, values: jax.Array) -> jax.Array:
-    """Returns the entry of the values [N, ...] at which [N] is True, 0 if none is."""
-    return jnp.sum(jnp.where(which.reshape(-1, *[1] * (values.ndim - 1)), values, 0), axis=0)
+def _chosen(choice: jax.Array, values: jax.Array) -> jax.Array:
+    """Returns the entry of the values [N, ...] where the choice [N] is True, 0 if nowhere."""
+    return jnp.sum(jnp.where(choice.reshape(-1, *[1] * (values.ndim - 1)), values, 0), axis=0)
 
 
 def _first_least(values: jax.Array) -> jax.Array:
-    """Returns which of the values [N] is the first of the least."""
+    """Returns the choice [N] of the first of the least values [N]."""
     return jnp.arange(len(values)) == jnp.argmin(values)
 
 
@@ -48,6 +48,7 @@ def _ball_on_box(center: jax.Array, radius: jax.Array, box: GeomInfo) -> Collisi
     square = jnp.dot(offset, offset)
     inside = square <= _ZERO[square.dtype.name]["length"] ** 2
     length = jnp.sqrt(jnp.where(inside, 1, square))
+    # Of the six faces, in C's order: at a tie C takes the first.
     depths = jnp.abs(jnp.stack([-box.size - center, box.size - center], axis=1)).ravel()
     nearest = _first_least(depths).reshape(3, 2)
     inward = nearest[:, 0].astype(square.dtype) - nearest[:, 1].astype(square.dtype)
@@ -62,13 +63,14 @@ def capsule_box(capsule: GeomInfo, box: GeomInfo) -> Collision:
     """Collides a capsule with a box where its axis is closest, and where C takes a second point."""
     center = (capsule.pos - box.pos) @ box.mat
     reach = capsule.mat[:, 2] @ box.mat * capsule.size[1]
-    first, second = _along_capsule(center, reach, capsule, box.size)
-    places = jnp.stack([first, first + second])
-    none = ~jnp.isfinite(places)
+    closest, step = _along_capsule(center, reach, capsule, box.size)
+    places = jnp.stack([closest, closest + step])
+    is_missing = ~jnp.isfinite(places)
     # Also where no contact is, all is finite: the solver multiplies it by zero.
-    centers = center + jnp.where(none, 0, places)[:, None] * reach
+    centers = center + jnp.where(is_missing, 0, places)[:, None] * reach
+    # As C: at both places the capsule is a sphere.
     dist, pos, frame = jax.vmap(lambda x: _ball_on_box(x, capsule.size[0], box))(centers)
-    return jnp.where(none, FAR, dist), pos, frame
+    return jnp.where(is_missing, FAR, dist), pos, frame
 
 
 # The edges of a box in C's order: the axis along which each runs, and the signs of the other two
@@ -94,29 +96,36 @@ def _along_capsule(
     # An end that is in the box or above a face.
     ends = center + jnp.stack([-reach, reach])
     beyond = ends - jnp.clip(ends, -size, size)
-    far = 2 * (capsule.size[0] + capsule.size[1] + jnp.sum(size))  # as in C, a length
-    over = jnp.sum(beyond != 0, axis=1) <= 1
-    squares = jnp.where(over, jnp.sum(beyond**2, axis=1), far)
-    end, least = _first_least(squares), jnp.min(squares)
-    first = jnp.where(least < far, jnp.where(end[0], -1.0, 1.0), jnp.inf)
-    second = _from_face(_chosen(end, ends), -first * reach, size, _chosen(end, beyond) != 0)
-    second = -first * second
+    # C compares squares with this length: ``bestdistmax``, which has the margin besides.
+    far = 2 * (capsule.size[0] + capsule.size[1] + jnp.sum(size))
+    over_face = jnp.sum(beyond != 0, axis=1) <= 1
+    squares = jnp.where(over_face, jnp.sum(beyond**2, axis=1), far)
+    end = _first_least(squares)
+    least_square = jnp.min(squares)
+    end_place = jnp.where(least_square < far, jnp.where(end[0], -1.0, 1.0), jnp.inf)
+    end_step = _from_face(_chosen(end, ends), -end_place * reach, size, _chosen(end, beyond) != 0)
+    end_step = -end_place * end_step
 
-    # An edge that is closer.
+    # An edge that is closer, by more than mjMINVAL: C's guard against an axis that is parallel to
+    # the box but for rounding. C looks at one edge after the other, so that the margin adds up.
     on_edge, on_axis, sides, squares = _closest_on_edges(center, reach, size)
-    number = -1
+    edge_number = -1
     for n in range(len(_RUNS)):
-        closer = squares[n] < least - 1e-15
-        least = jnp.where(closer, squares[n], least)
-        number = jnp.where(closer, n, number)
-    edge = jnp.arange(len(_RUNS)) == number
+        closer = squares[n] < least_square - 1e-15
+        least_square = jnp.where(closer, squares[n], least_square)
+        edge_number = jnp.where(closer, n, edge_number)
+    edge = jnp.arange(len(_RUNS)) == edge_number
     runs = jnp.any(edge[:, None] & _RUNS, axis=0)
-    side, place, along = (_chosen(edge, x) for x in (sides, on_edge, on_axis))
+    side, edge_place, axis_place = (_chosen(edge, x) for x in (sides, on_edge, on_axis))
+    # Along which coordinates capsule and corner point to different sides: ``axisdir ^ clcorner``.
     differs = (reach > 0) ^ jnp.where(runs, side > 0, _chosen(edge, jnp.asarray(_SIGNS)) > 0)
-    at_corner = _from_corner(along, reach, size, differs)
-    on = jnp.where(side == 0, _from_edge(along, place, reach, size, differs, runs), at_corner)
-    is_face = number < 0
-    return jnp.where(is_face, first, along), jnp.where(is_face, second, on)
+    corner_step = _from_corner(axis_place, reach, size, differs)
+    inside_edge = side == 0
+    edge_step = _from_edge(axis_place, edge_place, reach, size, differs, runs)
+    edge_step = jnp.where(inside_edge, edge_step, corner_step)
+    is_face = edge_number < 0
+    place = jnp.where(is_face, end_place, axis_place)
+    return place, jnp.where(is_face, end_step, edge_step)
 
 
 def _closest_on_edges(
@@ -127,26 +136,31 @@ def _closest_on_edges(
     They are the place on the edge and on the axis, in half lengths; the end of the edge that C
     takes it for, -1 or 1, or 0; and the square of the distance, infinite if both are parallel.
     """
+    # The normal equations of the distance between the two lines, in half lengths of each: ma, mb,
+    # mc, u and v of ``mjraw_CapsuleBox``.
     half = jnp.sum(jnp.where(_RUNS, size, 0), axis=1)
     offset = _SIGNS * size - center
-    edge, axis = half**2, jnp.dot(reach, reach)
-    both = -half * jnp.sum(jnp.where(_RUNS, reach, 0), axis=1)
+    edge_square = half**2
+    axis_square = jnp.dot(reach, reach)
+    product = -half * jnp.sum(jnp.where(_RUNS, reach, 0), axis=1)
     by_edge = -half * jnp.sum(jnp.where(_RUNS, offset, 0), axis=1)
     by_axis = offset @ reach
-    determinant = edge * axis - both**2
+    determinant = edge_square * axis_square - product**2
     zero = {"float64": 1e-15, "float32": 1e-12}[determinant.dtype.name]
     parallel = jnp.abs(determinant) < zero
     scale = jnp.where(parallel, 1, determinant)
-    on_edge = (axis * by_edge - both * by_axis) / scale
-    on_axis = (edge * by_axis - both * by_edge) / scale
+    on_edge = (axis_square * by_edge - product * by_axis) / scale
+    on_axis = (edge_square * by_axis - product * by_edge) / scale
+    # Off the edge's end, the place on the axis is that closest to the end. C then does the same at
+    # the axis' ends; there the side stays that of before, unless the new place is off the edge.
     bound = jnp.clip(on_edge, -1, 1)
     side = jnp.sign(on_edge - bound)
-    on_axis = jnp.where(side == 0, on_axis, (by_axis - both * bound) / axis)
-    again = (by_edge - both * jnp.clip(on_axis, -1, 1)) / edge
+    on_axis = jnp.where(side == 0, on_axis, (by_axis - product * bound) / axis_square)
+    from_axis_end = (by_edge - product * jnp.clip(on_axis, -1, 1)) / edge_square
     clamped = jnp.abs(on_axis) > 1
     on_axis = jnp.clip(on_axis, -1, 1)
-    side = jnp.where(clamped & (jnp.abs(again) > 1), jnp.sign(again), side)
-    on_edge = jnp.where(clamped, jnp.clip(again, -1, 1), bound)
+    side = jnp.where(clamped & (jnp.abs(from_axis_end) > 1), jnp.sign(from_axis_end), side)
+    on_edge = jnp.where(clamped, jnp.clip(from_axis_end, -1, 1), bound)
     gap = offset - on_axis[:, None] * reach + jnp.where(_RUNS, (half * on_edge)[:, None], 0)
     return on_edge, on_axis, side, jnp.where(parallel, jnp.inf, jnp.sum(gap**2, axis=1))
 
@@ -159,71 +173,103 @@ def _from_face(start: jax.Array, reach: jax.Array, size: jax.Array, face: jax.Ar
 
 
 def _from_corner(
-    first: jax.Array, reach: jax.Array, size: jax.Array, differs: jax.Array
+    place: jax.Array, reach: jax.Array, size: jax.Array, differs: jax.Array
 ) -> jax.Array:
-    """Returns how far on the second point is: along an edge of the corner, or across a face."""
-    several = jnp.sum(differs) == 2
-    axis = jnp.where(several, ~differs, differs)
-    sign = jnp.where(several, -1, 1)
+    """Returns how far on the second point is: along an edge of the corner, or across a face.
+
+    Args:
+      place: [] of the first point on the capsule's axis, in half lengths.
+      reach: [3] as in ``_along_capsule``.
+      size: [3] of the box.
+      differs: [3] along which coordinates capsule and corner point to different sides.
+    """
+    # Along one coordinate alone capsule and corner differ, or agree; C turns the second case into
+    # the first by following the capsule backwards (``mul``).
+    agrees_along_one = jnp.sum(differs) == 2
+    axis = jnp.where(agrees_along_one, ~differs, differs)
+    sign = jnp.where(agrees_along_one, -1, 1)
+    # How far it is to the opposite face, in half lengths: neither way may overshoot it.
     room = 2 * size / jnp.abs(reach)
-    ahead = jnp.minimum(1 - sign * first, _chosen(axis, room))
-    across = jnp.minimum(1 + sign * first, jnp.min(jnp.where(axis, jnp.inf, room)))
-    along = _chosen(axis, reach) ** 2 > 0.5 * jnp.dot(reach, reach)
-    none = jnp.all(differs) | ~jnp.any(differs)
-    return jnp.where(none, jnp.inf, sign * jnp.where(along, ahead, -across))
+    ahead = jnp.minimum(1 - sign * place, _chosen(axis, room))
+    across = jnp.minimum(1 + sign * place, jnp.min(jnp.where(axis, jnp.inf, room)))
+    follows_edge = _chosen(axis, reach) ** 2 > 0.5 * jnp.dot(reach, reach)
+    # A capsule that points to the corner, or away from it, meets the box there alone.
+    is_missing = jnp.all(differs) | ~jnp.any(differs)
+    return jnp.where(is_missing, jnp.inf, sign * jnp.where(follows_edge, ahead, -across))
 
 
 def _from_edge(
-    first: jax.Array,
+    place: jax.Array,
     on_edge: jax.Array,
     reach: jax.Array,
     size: jax.Array,
     differs: jax.Array,
     runs: jax.Array,
 ) -> jax.Array:
-    """Returns how far on the second point is, across the face that the axis is less inclined to."""
-    after, before = jnp.roll(runs, 1), jnp.roll(runs, 2)
-    steep = jnp.abs(reach)
-    wide = jnp.where(_chosen(after, steep) > _chosen(before, steep), after, before)
+    """Returns how far on the second point is, across the face that the axis is less inclined to.
+
+    Args:
+      place: [] of the first point on the capsule's axis, in half lengths.
+      on_edge: [] of that point on the edge.
+      reach: [3] as in ``_along_capsule``.
+      size: [3] of the box.
+      differs: [3] along which coordinates capsule and edge point to different sides.
+      runs: [3] along which coordinate the edge runs.
+    """
+    # The two coordinates across the edge: the face is wide along the steeper one.
+    next_axis = jnp.roll(runs, 1)
+    last_axis = jnp.roll(runs, 2)
+    steepness = jnp.abs(reach)
+    is_next = _chosen(next_axis, steepness) > _chosen(last_axis, steepness)
+    across = jnp.where(is_next, next_axis, last_axis)
     differs = differs & ~runs
-    ahead = jnp.any(differs & wide)
+    ahead = jnp.any(differs & across)
     sign = jnp.where(ahead, 1, -1)
-    rest = 1 - jnp.where(jnp.any((reach > 0) & runs) == ahead, on_edge, -on_edge)
-    length = jnp.minimum(1 - sign * first, _chosen(wide, 2 * size / steep))
-    length = jnp.minimum(length, _chosen(runs, size / steep) * rest)
+    # The way ends at the capsule's end, at the opposite face, or at the end of the edge.
+    edge_room = 1 - jnp.where(jnp.any((reach > 0) & runs) == ahead, on_edge, -on_edge)
+    length = jnp.minimum(1 - sign * place, _chosen(across, 2 * size / steepness))
+    length = jnp.minimum(length, _chosen(runs, size / steepness) * edge_room)
+    # Where edge and capsule form a T, not an X, there is no second point.
     return jnp.where(jnp.sum(differs) == 1, sign * length, jnp.inf)
 
 
 @collider(ncon=8)
-def box_box(first: GeomInfo, second: GeomInfo) -> Collision:
+def box_box(box1: GeomInfo, box2: GeomInfo) -> Collision:
     """Collides boxes: at the corners of where two faces overlap, or where two edges cross."""
-    turn = first.mat.T @ second.mat
-    offset = (second.pos - first.pos) @ first.mat
-    back = (first.pos - second.pos) @ second.mat
-    sizes = jnp.stack([first.size, second.size])
-    of_first = jnp.abs(offset) - first.size - jnp.abs(turn) @ second.size
-    of_second = jnp.abs(back) - second.size - first.size @ jnp.abs(turn)
-    faces = jnp.concatenate([of_first, of_second])
-    axes, edges = _edge_axes(turn, offset, sizes)
-    face, edge = _touching(faces, edges, jnp.concatenate([jnp.eye(3), turn.T]), axes)
+    # Stage 1 of ``mjc_BoxBox``: of 15 directions the one in which the boxes are farthest apart.
+    turn = box1.mat.T @ box2.mat
+    offset = (box2.pos - box1.pos) @ box1.mat
+    back = (box1.pos - box2.pos) @ box2.mat
+    sizes = jnp.stack([box1.size, box2.size])
+    gaps1 = jnp.abs(offset) - box1.size - jnp.abs(turn) @ box2.size
+    gaps2 = jnp.abs(back) - box2.size - box1.size @ jnp.abs(turn)
+    face_gaps = jnp.concatenate([gaps1, gaps2])
+    axes, edge_gaps = _edge_axes(turn, offset, sizes)
+    normals = jnp.concatenate([jnp.eye(3), turn.T])
+    face, edge = _touching(face_gaps, edge_gaps, normals, axes)
 
-    owned = jnp.any(face[:3])
-    faces_meet = jax.tree.map(
-        lambda x, y: jnp.where(owned, x, y),
+    # Stage 2: the box whose face it is clips the other's. Both ways are computed, as JAX would.
+    is_face1 = jnp.any(face[:3])
+    face_contacts = jax.tree.map(
+        lambda x, y: jnp.where(is_face1, x, y),
         _meet_at_face(face[:3], turn, offset, sizes),
         _meet_at_face(face[3:], turn.T, back, sizes[::-1]),
     )
-    dist, pos, normal = faces_meet
-    place, mat = jnp.where(owned, first.pos, second.pos), jnp.where(owned, first.mat, second.mat)
-    pos, normal = place + pos @ mat.T, mat @ jnp.where(owned, normal, -normal)
+    dist, pos, normal = face_contacts
+    origin = jnp.where(is_face1, box1.pos, box2.pos)
+    mat = jnp.where(is_face1, box1.mat, box2.mat)
+    pos = origin + pos @ mat.T
+    # MuJoCo's normals look from the first geom to the second.
+    normal = mat @ jnp.where(is_face1, normal, -normal)
 
+    # Two edges that cross have one contact; the other seven are far.
     crosses = jnp.any(edge)
     depth, middle, axis = _meet_at_edges(
         edge.reshape(3, 3), _chosen(edge, axes), turn, offset, sizes
     )
     dist = jnp.where(crosses, jnp.where(np.arange(8) == 0, depth, FAR), dist)
-    pos = jnp.where(crosses, first.pos + first.mat @ middle, pos)
-    frame = make_frame(jnp.where(crosses, first.mat @ axis, normal))
+    pos = jnp.where(crosses, box1.pos + box1.mat @ middle, pos)
+    frame = make_frame(jnp.where(crosses, box1.mat @ axis, normal))
     return dist, pos, jnp.broadcast_to(frame, (8, 3, 3))
 
 
@@ -237,6 +283,7 @@ def _edge_axes(turn: jax.Array, offset: jax.Array, sizes: jax.Array) -> tuple[ja
     """
     axes = jnp.cross(jnp.eye(3)[:, None], turn.T[None]).reshape(9, 3)
     squares = jnp.sum(axes**2, axis=1)
+    # Of nearly parallel edges the direction is rounding error, and the faces' normals cover it.
     parallel = squares < _ZERO[turn.dtype.name]["sine"]
     axes = axes / jnp.sqrt(jnp.where(parallel, 1, squares))[:, None]
     gaps = jnp.abs(axes @ offset) - jnp.abs(axes) @ sizes[0] - jnp.abs(axes @ turn) @ sizes[1]
@@ -246,7 +293,7 @@ def _edge_axes(turn: jax.Array, offset: jax.Array, sizes: jax.Array) -> tuple[ja
 def _touching(
     faces: jax.Array, edges: jax.Array, normals: jax.Array, axes: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Returns which face [6] boxes touch with, or which two edges [9]: where the gap is largest.
+    """Returns the face [6] that boxes touch with, or the two edges [9]: where the gap is largest.
 
     Edges must be better than faces, by more where both have almost one direction.
 
@@ -256,15 +303,21 @@ def _touching(
       normals: the faces' directions, [6, 3].
       axes: the edges' directions, [9, 3].
     """
-    face, of_face = _first_least(-faces), jnp.max(faces)
-    best, number = of_face, -1
+    face = _first_least(-faces)
+    face_gap = jnp.max(faces)
+    # At a tie a face is better for the solver: it has several contacts (``mjBOXBOX_EDGEBIAS``).
+    best_gap = face_gap
+    edge_number = -1
     for n in range(9):
-        better = (edges[n] - 1e-6 * jnp.abs(edges[n]) > best) & (edges[n] > of_face)
-        best, number = jnp.where(better, edges[n], best), jnp.where(better, n, number)
-    edge = jnp.arange(9) == number
-    alike = jnp.abs(jnp.dot(_chosen(edge, axes), _chosen(face, normals))) > 0.99
-    like_face = alike & (best < of_face + 0.05 * jnp.abs(of_face) + 1e-15)
-    return face & ((number < 0) | like_face), edge & ~like_face
+        is_better = (edges[n] - 1e-6 * jnp.abs(edges[n]) > best_gap) & (edges[n] > face_gap)
+        best_gap = jnp.where(is_better, edges[n], best_gap)
+        edge_number = jnp.where(is_better, n, edge_number)
+    # An edge almost along the face's normal (8 degrees) has to be better by 5% of the depth: else a
+    # stack of boxes at rest would alternate between the two by rounding.
+    edge = jnp.arange(9) == edge_number
+    is_along_face = jnp.abs(jnp.dot(_chosen(edge, axes), _chosen(face, normals))) > 0.99
+    is_face = is_along_face & (best_gap < face_gap + 0.05 * jnp.abs(face_gap) + 1e-15)
+    return face & ((edge_number < 0) | is_face), edge & ~is_face
 
 
 def _meet_at_face(
@@ -282,35 +335,43 @@ def _meet_at_face(
       sizes: of both, this box first, [2, 3].
     """
     sign = jnp.where(_chosen(axis, offset) >= 0, 1, -1)
+    # The incident face: that of the other box which is most opposed to this one.
     slopes = _chosen(axis, turn)
-    other = _first_least(-jnp.abs(slopes))
-    toward = jnp.where(sign * _chosen(other, slopes) > 0, -1, 1)
+    incident = _first_least(-jnp.abs(slopes))
+    toward = jnp.where(sign * _chosen(incident, slopes) > 0, -1, 1)
+    # Coordinates in which this face is the plane z = 0, and its box below; the order of the axes is
+    # a cyclic one, so that corners in turn stay in turn.
     local = jnp.stack([jnp.roll(axis, 1), jnp.roll(axis, 2), axis]).astype(turn.dtype)
     up = jnp.stack([jnp.ones_like(sign), jnp.ones_like(sign), sign])
 
-    def column(which: jax.Array) -> jax.Array:
-        return up * (local @ (_chosen(which, sizes[1]) * _chosen(which, turn.T)))
+    def half_edge(choice: jax.Array) -> jax.Array:
+        return up * (local @ (_chosen(choice, sizes[1]) * _chosen(choice, turn.T)))
 
-    half, height = (local @ sizes[0])[:2], _chosen(axis, sizes[0])
-    center = up * (local @ offset) + toward * column(other) - jnp.array([0, 0, 1]) * height
-    across = jnp.stack([column(jnp.roll(other, 1)), column(jnp.roll(other, 2))])
+    half = (local @ sizes[0])[:2]
+    height = _chosen(axis, sizes[0])
+    center = up * (local @ offset) + toward * half_edge(incident) - jnp.array([0, 0, 1]) * height
+    across = jnp.stack([half_edge(jnp.roll(incident, 1)), half_edge(jnp.roll(incident, 2))])
     determinant = across[0, 0] * across[1, 1] - across[0, 1] * across[1, 0]
 
+    # Where C clips a polygon by one side after the other (``clipHalfPlane``), the corners of the
+    # overlap are computed at once: where the other face's sides enter this one ...
     corners = center + _CORNERS @ across
     sides = jnp.roll(corners, -1, axis=0) - corners
-    enters, meets = _entry(corners[:, :2], sides[:, :2], half)
-    of_other = corners + enters[:, None] * sides
+    entries, meets = _entry(corners[:, :2], sides[:, :2], half)
+    incident_points = corners + entries[:, None] * sides
 
+    # ... and where this face's sides enter the other, in whose half edges they are given.
     back = jnp.array([[across[1, 1], -across[1, 0]], [-across[0, 1], across[0, 0]]]) / determinant
     around = jnp.where(determinant < 0, np.array([-1, 1]), 1)
     corners = (jnp.asarray(_CORNERS) * around * half - center[:2]) @ back.T
     sides = jnp.roll(corners, -1, axis=0) - corners
-    enters, meets_back = _entry(corners, sides, jnp.ones(2))
-    of_own = center + (corners + enters[:, None] * sides) @ across
+    entries, meets_back = _entry(corners, sides, jnp.ones(2))
+    reference_points = center + (corners + entries[:, None] * sides) @ across
 
-    points = jnp.concatenate([of_other, of_own])
-    different = _different(points, jnp.concatenate([meets, meets_back]), jnp.dot(half, half))
-    dist = jnp.where(different, points[:, 2], FAR)
+    points = jnp.concatenate([incident_points, reference_points])
+    is_corner = _different(points, jnp.concatenate([meets, meets_back]), jnp.dot(half, half))
+    # The third coordinate is the distance; the contact is midway between the surfaces.
+    dist = jnp.where(is_corner, points[:, 2], FAR)
     places = points.at[:, 2].set(sign * (height + points[:, 2] / 2))
     return dist, places @ local, sign * axis.astype(turn.dtype)
 
@@ -323,26 +384,30 @@ def _entry(starts: jax.Array, steps: jax.Array, half: jax.Array) -> tuple[jax.Ar
       steps: [N, 2].
       half: half the sides of the rectangle, which is about the origin, [2].
     """
+    # Corners on a side are in it, whatever the rounding: else a box on its equal loses contacts.
     half = half * (1 + _ZERO[starts.dtype.name]["depth"])
     flat = steps == 0
     meets = (jnp.stack([-half, half])[:, None] - starts) / jnp.where(flat, 1, steps)
-    first = jnp.max(jnp.where(flat, 0, jnp.min(meets, axis=0)), axis=1)
-    last = jnp.min(jnp.where(flat, 1, jnp.max(meets, axis=0)), axis=1)
+    # The segment is in the rectangle from where it has entered both strips to where it leaves one.
+    entry_place = jnp.max(jnp.where(flat, 0, jnp.min(meets, axis=0)), axis=1)
+    exit_place = jnp.min(jnp.where(flat, 1, jnp.max(meets, axis=0)), axis=1)
     inside = jnp.all(~flat | (jnp.abs(starts) <= half), axis=1)
-    first, last = jnp.maximum(first, 0), jnp.minimum(last, 1)
-    return first, inside & (first <= last)
+    entry_place = jnp.maximum(entry_place, 0)
+    exit_place = jnp.minimum(exit_place, 1)
+    return entry_place, inside & (entry_place <= exit_place)
 
 
 def _different(points: jax.Array, meets: jax.Array, square: jax.Array) -> jax.Array:
     """Returns which points [8, 3] are corners, and not at the place of another corner."""
     near = _ZERO[points.dtype.name]["twin"] * square
-    chosen: list[jax.Array] = []
+    is_corner: list[jax.Array] = []
     for n in range(8):
+        # Only corners that stay count: of three at one place the first remains.
         gaps = points[:n, :2] - points[n, :2]
-        same = [x & (jnp.dot(gap, gap) < near) for x, gap in zip(chosen, gaps, strict=True)]
-        twin = jnp.any(jnp.stack(same)) if same else False
-        chosen.append(meets[n] & ~twin)
-    return jnp.stack(chosen)
+        twins = [x & (jnp.dot(gap, gap) < near) for x, gap in zip(is_corner, gaps, strict=True)]
+        has_twin = jnp.any(jnp.stack(twins)) if twins else False
+        is_corner.append(meets[n] & ~has_twin)
+    return jnp.stack(is_corner)
 
 
 def _meet_at_edges(
@@ -357,32 +422,41 @@ def _meet_at_edges(
       offset: its center, [3].
       sizes: of both, [2, 3].
     """
-    runs = jnp.any(edge, axis=1), jnp.any(edge, axis=0)
+    runs1 = jnp.any(edge, axis=1)
+    runs2 = jnp.any(edge, axis=0)
+    # From the first box to the second, as MuJoCo's normals; ``axis2`` is in the second's frame.
     axis = jnp.where(jnp.dot(axis, offset) < 0, -axis, axis)
-    own = axis @ turn
-    part = _ZERO[axis.dtype.name]["part"]
-    corner = jnp.where(runs[0], 0, jnp.where(axis >= 0, sizes[0], -sizes[0]))
-    other = jnp.where(runs[1], 0, jnp.where(own >= 0, -sizes[1], sizes[1]))
-    along = _chosen(runs[1], turn.T)
-    cosine = _chosen(runs[0], along)
-    half, other_half = _chosen(runs[0], sizes[0]), _chosen(runs[1], sizes[1])
+    axis2 = axis @ turn
+    zero = _ZERO[axis.dtype.name]["part"]
+    # A corner of each box's edge that supports the axis, toward the other box.
+    corner1 = jnp.where(runs1, 0, jnp.where(axis >= 0, sizes[0], -sizes[0]))
+    corner2 = jnp.where(runs2, 0, jnp.where(axis2 >= 0, -sizes[1], sizes[1]))
+    direction2 = _chosen(runs2, turn.T)
+    cosine = _chosen(runs1, direction2)
+    half1 = _chosen(runs1, sizes[0])
+    half2 = _chosen(runs2, sizes[1])
 
     def closest(flips: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Returns the closest points [3] of two edges, and the square of their distance."""
-        start = jnp.where((jnp.abs(axis) < part) & flips[0], -corner, corner)
-        end = offset + turn @ jnp.where((jnp.abs(own) < part) & flips[1], -other, other)
-        gap = end - start
-        first, second = _chosen(runs[0], gap), jnp.dot(along, gap)
+        middle1 = jnp.where((jnp.abs(axis) < zero) & flips[0], -corner1, corner1)
+        corner = jnp.where((jnp.abs(axis2) < zero) & flips[1], -corner2, corner2)
+        middle2 = offset + turn @ corner
+        gap = middle2 - middle1
+        gap1 = _chosen(runs1, gap)
+        gap2 = jnp.dot(direction2, gap)
         scale = jnp.maximum(1 - cosine**2, _ZERO[axis.dtype.name]["sine"])
-        place = jnp.clip((first - cosine * second) / scale, -half, half)
-        there = jnp.clip(cosine * place - second, -other_half, other_half)
-        place = jnp.clip(first + cosine * there, -half, half)
-        ends = start + jnp.where(runs[0], place, 0), end + there * along
-        return *ends, jnp.sum((ends[1] - ends[0]) ** 2)
+        # Clamped to the first edge, then solved again for the second, and back.
+        place1 = jnp.clip((gap1 - cosine * gap2) / scale, -half1, half1)
+        place2 = jnp.clip(cosine * place1 - gap2, -half2, half2)
+        place1 = jnp.clip(gap1 + cosine * place2, -half1, half1)
+        point1 = middle1 + jnp.where(runs1, place1, 0)
+        point2 = middle2 + place2 * direction2
+        return point1, point2, jnp.sum((point2 - point1) ** 2)
 
     # Where the axis is almost along a face, either edge of the face may be the one: the closer is.
-    ways = jnp.array([[False, False], [False, True], [True, False], [True, True]])
-    starts, ends, squares = jax.vmap(closest)(ways)
+    flips = jnp.array([[False, False], [False, True], [True, False], [True, True]])
+    points1, points2, squares = jax.vmap(closest)(flips)
     best = _first_least(squares)
-    start, end = _chosen(best, starts), _chosen(best, ends)
-    return jnp.dot(end - start, axis), (start + end) / 2, axis
+    point1 = _chosen(best, points1)
+    point2 = _chosen(best, points2)
+    return jnp.dot(point2 - point1, axis), (point1 + point2) / 2, axis

@@ -42,11 +42,11 @@ class Group(NamedTuple):
 class Blocks(NamedTuple):
     """How the rows divide.
 
-    others: the leading rows, which belong to no contact
+    num_contact_free: of the leading rows, which belong to no contact
     groups: the contacts
     """
 
-    others: int
+    num_contact_free: int
     groups: tuple[Group, ...]
 
 
@@ -61,20 +61,21 @@ class Jacobian(NamedTuple):
     bases: Sequence[jax.Array]
 
 
-def blocks(others: int, dims: np.ndarray, couplings: Mapping[int, np.ndarray]) -> Blocks:
+def blocks(num_contact_free: int, dims: np.ndarray, couplings: Mapping[int, np.ndarray]) -> Blocks:
     """Returns the division for contacts [C] of these dimensions under pyramidal cones.
 
     Args:
-      others: the rows of no contact, which come first.
+      num_contact_free: the rows of no contact, which come first.
       dims: [C]
       couplings: of ``couplings``.
     """
+    # MJX orders contacts by their dimension, so that each group's rows are next to one another.
     groups = tuple(
         Group(int((dims == dim).sum()), _pyramid(dim), coupled)
         for dim, coupled in sorted(couplings.items())
         if (dims == dim).any()
     )
-    return Blocks(others, groups)
+    return Blocks(num_contact_free, groups)
 
 
 def couplings(model: mjx.Model) -> dict[int, np.ndarray]:
@@ -83,11 +84,11 @@ def couplings(model: mjx.Model) -> dict[int, np.ndarray]:
     A contact's rows have those that move one of its two bodies. The bools are [nv, nv].
     """
     moves = _moves(model)
-    found: dict[int, np.ndarray] = {}
-    for dim, first, second in geom_groups(model):
-        either = moves[model.geom_bodyid[first]] | moves[model.geom_bodyid[second]]
-        found[dim] = found.get(dim, False) | np.outer(either, either)
-    return found
+    couplings: dict[int, np.ndarray] = {}
+    for dim, geom1, geom2 in geom_groups(model):
+        either = moves[model.geom_bodyid[geom1]] | moves[model.geom_bodyid[geom2]]
+        couplings[dim] = couplings.get(dim, False) | np.outer(either, either)
+    return couplings
 
 
 def _moves(model: mjx.Model) -> np.ndarray:
@@ -102,6 +103,7 @@ def _pyramid(dim: int) -> np.ndarray:
     """Returns the edges [rows, dim] of a contact's pyramid: n + t_i, n - t_i; for one row, n."""
     if dim == 1:
         return np.eye(1)
+    # C's order: both edges of one tangent (or of torsion, rolling), then those of the next.
     tangents = np.kron(np.eye(dim - 1), [[1.0], [-1.0]])
     return np.hstack([np.ones((len(tangents), 1)), tangents])
 
@@ -117,24 +119,29 @@ def with_bases(division: Blocks, rows: jax.Array, touching: jax.Array) -> Jacobi
     if not is_written_out():
         return Jacobian(rows, [])
 
-    bases, parts = [], (by_group(division, rows), _of_groups(division, touching))
-    for group, *each in zip(division.groups, *parts, strict=True):
+    bases = []
+    group_rows = by_group(division, rows)
+    group_touching = _of_groups(division, touching)
+    for group, contact_rows, touches in zip(
+        division.groups, group_rows, group_touching, strict=True
+    ):
+        # A pyramid's columns are orthogonal: n is the mean of the edges, t_i half a difference.
         inverse = group.pyramid.T / np.sum(group.pyramid**2, 0)[:, None]
         basis = functools.partial(jnp.matmul, jnp.asarray(inverse, rows.dtype))
-        bases.append(_of_touching(basis, *each))
+        bases.append(_of_touching(basis, contact_rows, touches))
     return Jacobian(rows, bases)
 
 
 def _of_touching(function: Callable, rows: jax.Array, touching: jax.Array) -> jax.Array:
     """Returns a function of the rows of each contact that touches; zeros for the others."""
 
-    def of_one(_: None, one: tuple) -> tuple[None, jax.Array]:
-        rows, touches = one
-        made = jax.eval_shape(function, rows)
-        zeros = jnp.zeros(made.shape, made.dtype)
+    def apply(_: None, contact: tuple) -> tuple[None, jax.Array]:
+        rows, touches = contact
+        shape = jax.eval_shape(function, rows)
+        zeros = jnp.zeros(shape.shape, shape.dtype)
         return None, skippable(touches, lambda: function(rows), zeros)
 
-    return short_scan(of_one, None, (rows, touching))[1]
+    return short_scan(apply, None, (rows, touching))[1]
 
 
 def weighted(
@@ -149,32 +156,39 @@ def weighted(
       mass: [rows]; where all of a contact's are zero, its forces are zero too.
       force: [rows]
     """
-    others = slice(division.others if is_written_out() else None)
-    rows = jacobian.rows[others]
-    sums = start + (rows.T * mass[others]) @ rows, rows.T @ force[others]
+    # Where XLA compiles, all rows are one product; written out, contacts follow one by one.
+    dense = slice(division.num_contact_free if is_written_out() else None)
+    rows = jacobian.rows[dense]
+    sums = start + (rows.T * mass[dense]) @ rows, rows.T @ force[dense]
     if not is_written_out():
         return sums
-    parts = by_group(division, mass), by_group(division, force)
-    for group, basis, *each in zip(division.groups, jacobian.bases, *parts, strict=True):
+    group_mass = by_group(division, mass)
+    group_force = by_group(division, force)
+    for group, *contacts in zip(
+        division.groups, jacobian.bases, group_mass, group_force, strict=True
+    ):
         pyramid = jnp.asarray(group.pyramid, start.dtype)
 
-        def add(
-            sums: tuple, one: tuple, pyramid: jax.Array = pyramid, group: Group = group
+        def add_contact(
+            sums: tuple, contact: tuple, pyramid: jax.Array = pyramid, group: Group = group
         ) -> tuple[tuple, None]:
-            basis, mass, force = one
+            """Adds to both products what a contact's rows have; nothing if none of them pushes."""
+            basis, mass, force = contact
 
-            def pushed() -> tuple:
-                hessian, joint_force = sums
+            def add_rows() -> tuple:
+                """Returns both products with the contact's part, computed in its basis."""
+                hessian, qfrc_constraint = sums
+                # J' D J = B' (P' D P) B, of rows J = P B: P' D P is smaller than D.
                 weights = (pyramid.T * mass) @ pyramid @ basis
-                added = _plus_product(hessian, basis.T[:, None], weights.T[None])
+                total = _plus_product(hessian, basis.T[:, None], weights.T[None])
                 return (
-                    jnp.where(group.coupled, added, hessian),
-                    _plus_product(joint_force, basis.T, pyramid.T @ force),
+                    jnp.where(group.coupled, total, hessian),
+                    _plus_product(qfrc_constraint, basis.T, pyramid.T @ force),
                 )
 
-            return skippable(jnp.any(mass != 0), pushed, sums), None
+            return skippable(jnp.any(mass != 0), add_rows, sums), None
 
-        sums, _ = short_scan(add, sums, (basis, *each))
+        sums, _ = short_scan(add_contact, sums, tuple(contacts))
     return sums
 
 
@@ -192,38 +206,39 @@ def along(
     if not is_written_out():
         return jacobian.rows @ direction
 
-    products = [jacobian.rows[: division.others] @ direction]
-    parts = jacobian.bases, _of_groups(division, touching)
-    for group, *each in zip(division.groups, *parts, strict=True):
+    products = [jacobian.rows[: division.num_contact_free] @ direction]
+    group_touching = _of_groups(division, touching)
+    for group, bases, touches in zip(division.groups, jacobian.bases, group_touching, strict=True):
         pyramid = jnp.asarray(group.pyramid, direction.dtype)
         product = lambda basis, pyramid=pyramid: pyramid @ (basis @ direction)  # noqa: E731
-        products.append(_of_touching(product, *each).reshape(-1))
+        products.append(_of_touching(product, bases, touches).reshape(-1))
     return jnp.concatenate(products)
 
 
-def _plus_product(start: jax.Array, left: jax.Array, right: jax.Array) -> jax.Array:
-    """Returns start + sum over the last axis of left * right.
+def _plus_product(start: jax.Array, factor1: jax.Array, factor2: jax.Array) -> jax.Array:
+    """Returns start + sum over the last axis of factor1 * factor2.
 
     Each entry is added up from its start on: in machine code these are fused multiply-adds.
     """
-    left, right = jnp.broadcast_arrays(left, right)
-    terms = jnp.concatenate([start[..., None], left], -1)
-    factors = jnp.concatenate([jnp.ones_like(start)[..., None], right], -1)
+    factor1, factor2 = jnp.broadcast_arrays(factor1, factor2)
+    terms = jnp.concatenate([start[..., None], factor1], -1)
+    factors = jnp.concatenate([jnp.ones_like(start)[..., None], factor2], -1)
     return jnp.einsum("...k,...k->...", terms, factors)
 
 
 def _of_groups(division: Blocks, touching: jax.Array) -> list[jax.Array]:
     """Divides an array [C] into the groups' [contacts]."""
-    ends = np.cumsum([0, *(group.contacts for group in division.groups)])
-    return [touching[first:last] for first, last in itertools.pairwise(ends)]
+    bounds = np.cumsum([0, *(group.contacts for group in division.groups)])
+    return [touching[start:stop] for start, stop in itertools.pairwise(bounds)]
 
 
 def by_group(division: Blocks, rows: jax.Array) -> list[jax.Array]:
     """Divides an array [rows, ...] into the groups' [contacts, rows of a contact, ...]."""
-    divided, first = [], division.others
+    group_rows = []
+    start = division.num_contact_free
     for group in division.groups:
         size = len(group.pyramid)
-        last = first + group.contacts * size
-        divided.append(rows[first:last].reshape(group.contacts, size, *rows.shape[1:]))
-        first = last
-    return divided
+        stop = start + group.contacts * size
+        group_rows.append(rows[start:stop].reshape(group.contacts, size, *rows.shape[1:]))
+        start = stop
+    return group_rows

@@ -65,7 +65,9 @@ Collide = Callable[..., Any]
 @collider(ncon=2)
 def plane_capsule(plane: GeomInfo, capsule: GeomInfo) -> Collision:
     """Collides both ends of a capsule with a plane; the first tangents follow its axis."""
-    normal, axis = plane.mat[:, 2], capsule.mat[:, 2]
+    normal = plane.mat[:, 2]
+    axis = capsule.mat[:, 2]
+    # ``mjc_PlaneCapsule`` aligns the frame with the axis at any angle, MJX up to 60 degrees.
     tangent, _ = _direction(axis - normal * jnp.dot(normal, axis))
     frame = jnp.stack([normal, tangent, jnp.cross(normal, tangent)])
     segment = axis * capsule.size[1]
@@ -78,6 +80,7 @@ def plane_capsule(plane: GeomInfo, capsule: GeomInfo) -> Collision:
 @collider(ncon=4)
 def plane_box(plane: GeomInfo, box: GeomInfo) -> Collision:
     """Collides a plane with the lower corner of each of a box's four diagonals."""
+    # One corner of each diagonal; the opposite one is its negative. C stops at four contacts, too.
     corners = np.array([[1, 1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, -1]]) * box.size @ box.mat.T
     up = corners @ plane.mat[:, 2] > 0
     return _collide_points(plane, box.pos + jnp.where(up[:, None], -corners, corners))
@@ -90,51 +93,64 @@ def plane_cylinder(plane: GeomInfo, cylinder: GeomInfo) -> Collision:
     They are two of the lower rim, a third around, or the lowest of the other rim if it is lower: C
     has that one in addition, which matters only where all four are within the margin.
     """
-    normal, axis = plane.mat[:, 2], cylinder.mat[:, 2]
+    normal = plane.mat[:, 2]
+    # Down along the axis, and down across it; an upright cylinder has its own x axis for that, as
+    # in ``mjc_PlaneCylinder``.
+    axis = cylinder.mat[:, 2]
     axis = jnp.where(jnp.dot(normal, axis) > 0, -axis, axis)
     down, length = _direction(axis * jnp.dot(axis, normal) - normal)
     down = cylinder.size[0] * jnp.where(length == 0, cylinder.mat[:, 0], down)
-    across, half = jnp.cross(down, axis) * np.sqrt(0.75), cylinder.size[1] * axis
+    # Three points of the lower rim, 120 degrees apart.
+    across = jnp.cross(down, axis) * np.sqrt(0.75)
+    half = cylinder.size[1] * axis
     rim = half + jnp.stack([down, across - down / 2, -across - down / 2])
-    other = down - half
-    lower = jnp.dot(other, normal) < jnp.dot(rim[1], normal)
-    return _collide_points(plane, cylinder.pos + rim.at[1].set(jnp.where(lower, other, rim[1])))
+    # The upper rim's lowest point takes the second's place if it is lower, as where it lies.
+    upper = down - half
+    is_lower = jnp.dot(upper, normal) < jnp.dot(rim[1], normal)
+    return _collide_points(plane, cylinder.pos + rim.at[1].set(jnp.where(is_lower, upper, rim[1])))
 
 
 @collider(ncon=1)
 def sphere_capsule(sphere: GeomInfo, capsule: GeomInfo) -> Collision:
     """Collides a sphere with the point of a capsule's axis that is closest to it."""
-    axis, half = capsule.mat[:, 2], capsule.size[1]
+    axis = capsule.mat[:, 2]
+    half = capsule.size[1]
     along = jnp.clip(jnp.dot(axis, sphere.pos - capsule.pos), -half, half)
     return _collide_spheres(sphere, sphere.pos, capsule, capsule.pos + along * axis)
 
 
 @collider(ncon=1)
-def capsule_capsule(first: GeomInfo, second: GeomInfo) -> Collision:
+def capsule_capsule(capsule1: GeomInfo, capsule2: GeomInfo) -> Collision:
     """Collides two capsules where their axes are closest."""
-    point1, point2 = _closest_points(first, second)
-    return _collide_spheres(first, point1, second, point2)
+    point1, point2 = _closest_points(capsule1, capsule2)
+    return _collide_spheres(capsule1, point1, capsule2, point2)
 
 
-def _closest_points(first: GeomInfo, second: GeomInfo) -> tuple[jax.Array, jax.Array]:
+def _closest_points(capsule1: GeomInfo, capsule2: GeomInfo) -> tuple[jax.Array, jax.Array]:
     """Returns the point of each capsule's axis that is closest to the other's axis, [3] each."""
-    axis1, axis2 = first.mat[:, 2] * first.size[1], second.mat[:, 2] * second.size[1]
-    offset = first.pos - second.pos
+    axis1 = capsule1.mat[:, 2] * capsule1.size[1]
+    axis2 = capsule2.mat[:, 2] * capsule2.size[1]
+    offset = capsule1.pos - capsule2.pos
 
     def meet(along1: float | jax.Array) -> jax.Array:
         """Returns a place on the first axis and the closest on the second, in half lengths."""
-        free = jnp.dot(offset + along1 * axis1, axis2) / jnp.dot(axis2, axis2)
-        along2 = jnp.clip(free, -1, 1)
+        unclipped = jnp.dot(offset + along1 * axis1, axis2) / jnp.dot(axis2, axis2)
+        along2 = jnp.clip(unclipped, -1, 1)
+        # Past the second axis' end, the first place is that closest to the end.
         back = jnp.dot(along2 * axis2 - offset, axis1) / jnp.dot(axis1, axis1)
-        return jnp.stack([jnp.where(free == along2, along1, jnp.clip(back, -1, 1)), along2])
+        return jnp.stack([jnp.where(unclipped == along2, along1, jnp.clip(back, -1, 1)), along2])
 
+    # Two lines cross where the determinant of ``mjraw_CapsuleCapsule`` is not zero. It is computed
+    # as the square of a cross product, which keeps its digits between almost parallel axes.
     normal = jnp.cross(axis1, axis2)
-    square, scale = jnp.dot(normal, normal), jnp.dot(axis1, axis1) * jnp.dot(axis2, axis2)
+    square = jnp.dot(normal, normal)
+    scale = jnp.dot(axis1, axis1) * jnp.dot(axis2, axis2)
     parallel = square <= _PARALLEL * scale
     crossing = jnp.dot(normal, jnp.cross(axis2, offset)) / jnp.where(parallel, scale, square)
+    # Parallel axes are closest all along their overlap. C has a contact at each of its ends.
     middle = (meet(-1.0) + meet(1.0)) / 2
     along1, along2 = jnp.where(parallel, middle, meet(jnp.clip(crossing, -1, 1)))
-    return first.pos + along1 * axis1, second.pos + along2 * axis2
+    return capsule1.pos + along1 * axis1, capsule2.pos + along2 * axis2
 
 
 @collider(ncon=1)
@@ -153,13 +169,16 @@ def capsule_cylinder(capsule: GeomInfo, cylinder: GeomInfo) -> Collision:
     On a cap are two contacts, at the ends of the part of the capsule's lowest line that is above a
     polygon of 16 corners in the cap's rim, as in C; elsewhere one, and one that is far.
     """
-    radius, half = capsule.size[0], capsule.size[1]
+    # In the cylinder's frame: one contact where the capsule's axis is closest.
+    radius = capsule.size[0]
+    half = capsule.size[1]
     center = (capsule.pos - cylinder.pos) @ cylinder.mat
     axis = capsule.mat[:, 2] @ cylinder.mat
     along = _closest_along(center, axis, half, cylinder.size)
     dist, outward = _from_cylinder(center + along * axis, cylinder.size)
-    one = center + along * axis - outward * (radius + (dist - radius) / 2)
+    contact = center + along * axis - outward * (radius + (dist - radius) / 2)
 
+    # Two contacts on a cap, at the ends of what the cap holds of the capsule's lowest line.
     cap = jnp.where(outward[2] > 0, 1.0, -1.0) * jnp.eye(3, dtype=axis.dtype)[2]
     line = center - radius * (outward - axis * jnp.dot(axis, outward))
     start, end = _above_polygon(line, axis, half, cylinder.size[0])
@@ -168,7 +187,7 @@ def capsule_cylinder(capsule: GeomInfo, cylinder: GeomInfo) -> Collision:
     depths = ends @ cap - cylinder.size[1]
 
     dist = jnp.where(lies, depths, jnp.stack([dist - radius, jnp.full((), _FAR, axis.dtype)]))
-    pos = jnp.where(lies, ends - depths[:, None] / 2 * cap, one)
+    pos = jnp.where(lies, ends - depths[:, None] / 2 * cap, contact)
     frame = make_frame(-cylinder.mat @ jnp.where(lies, cap, outward))
     return dist, cylinder.pos + pos @ cylinder.mat.T, jnp.stack([frame, frame])
 
@@ -182,7 +201,9 @@ def _from_cylinder(point: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Ar
     """
     upright = jnp.eye(3, dtype=point.dtype)[2]
     outward, away = _direction(point * (1 - upright))
-    side, cap = away - size[0], jnp.abs(point[2]) - size[1]
+    # Beyond both the side and the cap the rim is closest; inside, whichever of the two is nearer.
+    side = away - size[0]
+    cap = jnp.abs(point[2]) - size[1]
     outside = jnp.maximum(jnp.stack([side, cap]), 0)
     length = jnp.sqrt(jnp.dot(outside, outside))
     nearest = jnp.stack([side >= cap, side < cap]).astype(point.dtype)
@@ -199,16 +220,19 @@ def _closest_along(
     The distance is convex along the segment: its slope is bisected, for the first and the last of
     the places that are equally close, of which this is the middle.
     """
-    level = jnp.asarray([-1, 1], axis.dtype) * jnp.sqrt(jnp.finfo(axis.dtype).eps)
+    # Slopes between these two count as zero: rounding leaves such of parallel lines.
+    levels = jnp.asarray([-1, 1], axis.dtype) * jnp.sqrt(jnp.finfo(axis.dtype).eps)
 
     def halve(ends: jax.Array, _: None) -> tuple[jax.Array, None]:
         middle = (ends[0] + ends[1]) / 2
         points = center + middle[:, None] * axis
         slope = jax.vmap(lambda point: _from_cylinder(point, size)[1])(points) @ axis
-        ahead = slope < level
+        ahead = slope < levels
         return jnp.where(ahead, jnp.stack([middle, ends[1]]), jnp.stack([ends[0], middle])), None
 
+    # Both bisections at once, [lower and upper end, first and last place].
     ends = half * jnp.asarray([[-1, -1], [1, 1]], axis.dtype)
+    # As many halvings as the mantissa has bits: an interval cannot be smaller.
     steps = jnp.finfo(axis.dtype).nmant
     unroll = not is_written_out()  # see `fenced`
     return jnp.mean(lax.scan(halve, ends, None, steps, unroll=unroll)[0])
@@ -221,15 +245,17 @@ def _above_polygon(
 
     The polygon has 16 corners on a circle about the origin, one of them on the x axis.
     """
+    # The outward normals of the sides, and how far the segment's center is inside each of them.
     angle = (np.arange(16) + 0.5) * np.pi / 8
-    sides = jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], 1), axis.dtype)
-    room = radius * np.cos(np.pi / 16) - sides @ center[:2]
-    speed = sides @ axis[:2]
+    normals = jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], 1), axis.dtype)
+    room = radius * np.cos(np.pi / 16) - normals @ center[:2]
+    speed = normals @ axis[:2]
+    # It is in the polygon once it has entered all sides that it goes toward, until it leaves one.
     meets = room / jnp.where(speed == 0, 1, speed)
     start = jnp.max(jnp.where(speed < 0, meets, -half))
     end = jnp.min(jnp.where(speed > 0, meets, half))
-    out = jnp.any((speed == 0) & (room < 0))
-    return jnp.where(out, half, jnp.maximum(start, -half)), jnp.minimum(end, half)
+    is_outside = jnp.any((speed == 0) & (room < 0))
+    return jnp.where(is_outside, half, jnp.maximum(start, -half)), jnp.minimum(end, half)
 
 
 def _collide_points(plane: GeomInfo, points: jax.Array) -> Collision:
@@ -241,14 +267,15 @@ def _collide_points(plane: GeomInfo, points: jax.Array) -> Collision:
 
 
 def _collide_spheres(
-    first: GeomInfo, point1: jax.Array, second: GeomInfo, point2: jax.Array
+    geom1: GeomInfo, point1: jax.Array, geom2: GeomInfo, point2: jax.Array
 ) -> Collision:
     """Collides spheres of two geoms' radii about given points."""
     normal, length = _direction(point2 - point1)
-    across, _ = _direction(jnp.cross(first.mat[:, 2], second.mat[:, 2]))
+    # Points at one place have no direction between them: C then takes that across both axes.
+    across, _ = _direction(jnp.cross(geom1.mat[:, 2], geom2.mat[:, 2]))
     normal = jnp.where(length == 0, across, normal)
-    dist = length - (first.size[0] + second.size[0])
-    return dist, point1 + normal * (first.size[0] + dist / 2), make_frame(normal)
+    dist = length - (geom1.size[0] + geom2.size[0])
+    return dist, point1 + normal * (geom1.size[0] + dist / 2), make_frame(normal)
 
 
 def _direction(vector: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -269,40 +296,48 @@ def one_by_one(collide: Collide) -> Collide:
       collide: made by MJX's ``collider``, for geoms with a bounding sphere.
     """
 
-    def together(model: mjx.Model, data: mjx.Data, key: Any, geoms: Any) -> Any:
+    def collide_pairs(model: mjx.Model, data: mjx.Data, key: Any, geoms: Any) -> Any:
+        """Collides pairs of geoms [P, 2], as ``collide``; written out, in a loop over them."""
         if model.npair or not is_written_out():  # pairs have margins of their own
             return collide(model, data, key, geoms)
-        first, second = geoms.T
-        each = data.geom_xpos, data.geom_xmat, model.geom_size
-        spheres = model.geom_rbound[first] + model.geom_rbound[second]
-        margins = model.geom_margin[first] + model.geom_margin[second]
-        rows = *(jnp.stack([x[first], x[second]], 1) for x in each), spheres, margins
+        geom1, geom2 = geoms.T
+        fields = data.geom_xpos, data.geom_xmat, model.geom_size
+        spheres = model.geom_rbound[geom1] + model.geom_rbound[geom2]
+        margins = model.geom_margin[geom1] + model.geom_margin[geom2]
+        rows = *(jnp.stack([x[geom1], x[geom2]], 1) for x in fields), spheres, margins
 
-        def pair(
+        def collide_pair(
             pos: jax.Array, mat: jax.Array, size: jax.Array, spheres: Any, margin: jax.Array
         ) -> Any:
+            """Collides one pair, whose pos, mat and size are [2, ...], if its spheres meet."""
+            # All that a collision function reads of MJX's data and model.
             place = types.SimpleNamespace(geom_xpos=pos, geom_xmat=mat)
             shape = types.SimpleNamespace(geom_size=size)
 
             def near() -> Any:
                 return collide(shape, place, key, np.array([[0, 1]]))
 
-            dist, *others = jax.eval_shape(near)
+            dist, *pos_frame = jax.eval_shape(near)
+            # A lower bound of the distance, which is above the margin: the contact is not active.
             gap = jnp.linalg.norm(pos[1] - pos[0]) - spheres
             return lax.cond(
                 gap > margin,
-                lambda: (jnp.full(dist.shape, gap), *(jnp.zeros(x.shape, x.dtype) for x in others)),
+                lambda: (
+                    jnp.full(dist.shape, gap),
+                    *(jnp.zeros(x.shape, x.dtype) for x in pos_frame),
+                ),
                 near,
             )
 
-        contacts = short_scan(lambda _, row: (None, pair(*row)), None, rows)[1]
+        contacts = short_scan(lambda _, row: (None, collide_pair(*row)), None, rows)[1]
         return jax.tree.map(jnp.concatenate, contacts)
 
-    together.ncon = collide.ncon  # pyright: ignore
-    return together
+    # MJX asks a collision function for how many contacts a pair has.
+    collide_pairs.ncon = collide.ncon  # pyright: ignore
+    return collide_pairs
 
 
-_OURS = {
+_LIKE_C = {
     (mjx.GeomType.PLANE, mjx.GeomType.CAPSULE): plane_capsule,
     (mjx.GeomType.PLANE, mjx.GeomType.CYLINDER): plane_cylinder,
     (mjx.GeomType.PLANE, mjx.GeomType.BOX): plane_box,
@@ -340,10 +375,12 @@ _SOLID_GEOMS = {getattr(mjx.GeomType, x) for x in ("SPHERE", "CAPSULE", "CYLINDE
 
 def _functions(table: dict[Any, Collide]) -> dict[Any, Collide]:
     """Returns the collision functions: MJX's, and in their place ours."""
-    return {
-        pair: one_by_one(function) if set(pair) <= _SOLID_GEOMS else function
-        for pair, function in (table | _OURS).items()
-    }
+    functions = table | _LIKE_C
+    for pair, function in functions.items():
+        # A plane has no bounding sphere to compare: its ``geom_rbound`` is zero.
+        if set(pair) <= _SOLID_GEOMS:
+            functions[pair] = one_by_one(function)
+    return functions
 
 
 #: ``mjx.collision`` and ``mjx.make_data`` with this module's contacts.
@@ -353,6 +390,7 @@ make_data = mjx_internals.data_with(_functions)
 
 def fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Computes what depends on position: ``mjx.fwd_position`` with this module's contacts."""
+    # The stages of ``mj_fwdPosition``. MJX's function binds its own collisions and rows.
     data = mjx.kinematics(model, data)
     data = mjx.com_pos(model, data)
     data = mjx.camlight(model, data)

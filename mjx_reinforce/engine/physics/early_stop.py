@@ -28,15 +28,17 @@ from mjx_reinforce.engine.scalar import is_written_out, short_scan
 #: Fewer are few: in the mechanisms of ``experiments/checks/matrix.py`` C takes 6 steps at most, and
 #: evaluates 22 lengths at most for one. Gymnasium's Pusher allows 20 steps; MuJoCo's default is 50
 #: lengths.
-_STEPS, _LENGTHS = 20, 50
-#: mjMINVAL and the flag for one island: what C takes for zero, and what MJX has no name for.
+_ENOUGH_STEPS = 20
+_ENOUGH_LENGTHS = 50
+#: mjMINVAL: what C takes for zero.
 _TINY = 1e-15
+#: The flag for one island, of which MJX has no name.
 _NO_ISLANDS = int(mujoco.mjtDisableBit.mjDSBL_ISLAND)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def stops_early(model: Any) -> bool:
     """Returns whether a model, C's or MJX's, allows its solver few steps, or lengths of one."""
-    return model.opt.iterations < _STEPS or model.opt.ls_iterations < _LENGTHS
+    return model.opt.iterations < _ENOUGH_STEPS or model.opt.ls_iterations < _ENOUGH_LENGTHS
 
 
 class _Islands(NamedTuple):
@@ -62,14 +64,15 @@ class _Islands(NamedTuple):
         """Gives each degree of freedom or row what its island has; without one, zero."""
         if self.size == 1:
             return values[0]
+        # At most one island is not masked, so that the sum is a lookup; machine code has none.
         members = labels == jnp.arange(self.size)[:, None]
-        return jnp.sum(jnp.where(members, values[:, None], 0), 0)  # machine code has no lookups
+        return jnp.sum(jnp.where(members, values[:, None], 0), 0)
 
 
 class _Mark(NamedTuple):
     """A length of the step of each island, [islands], and there the cost and its derivatives.
 
-    The cost is that above the cost at length zero.
+    The cost is that above the cost at length zero, as in ``mjPrimalPnt`` of C.
     """
 
     length: jax.Array
@@ -88,16 +91,16 @@ class _Bracket(NamedTuple):
 
     ends: the two ends
     nexts: of each end a length where the slope may be zero
-    evaluated: [islands] how many lengths were
-    settled: [islands] whether the search is over
-    end: where it ended
+    evaluations: [islands] how many lengths were evaluated
+    converged: [islands] whether the search is over
+    best: where it ended, if it did
     """
 
     ends: tuple[_Mark, _Mark]
     nexts: tuple[_Mark, _Mark]
-    evaluated: jax.Array
-    settled: jax.Array
-    end: _Mark
+    evaluations: jax.Array
+    converged: jax.Array
+    best: _Mark
 
 
 class _Search(NamedTuple):
@@ -105,14 +108,14 @@ class _Search(NamedTuple):
 
     point: the acceleration reached, and what the next step needs of it
     improvement: [islands] by how much the last step lowered the cost
-    steps: [] how many were made
-    going: [islands] whether an island's search goes on
+    steps: [] how many led there
+    is_active: [islands] whether an island's search goes on
     """
 
     point: newton.Point
     improvement: jax.Array
     steps: jax.Array
-    going: jax.Array
+    is_active: jax.Array
 
 
 def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -125,53 +128,66 @@ def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.A
     Returns:
       The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
     """
-    problem = newton.posed(model, data)
-    rows, inertia, tolerance = problem.rows, problem.inertia, model.opt.tolerance
+    problem = newton.problem_of(model, data)
+    rows = problem.rows
+    inertia = problem.inertia
+    tolerance = model.opt.tolerance
     islands = _islands(model, jax_fields(data).efc_J)
     scale = _scale(model, inertia, islands)
 
     def improve(search: _Search) -> _Search:
+        """Makes one step of ``mj_solPrimal`` in every island whose search goes on."""
         before = search.point
         direction, gradient = newton.newton_direction(problem, before)
         if islands.size > 1:
             direction = jnp.where(islands.dofs < islands.size, direction, 0)
-        flat = scale * jnp.sqrt(islands.total(gradient**2, islands.dofs)) < tolerance
+        # C's tests after a step, here before the next. Before the very first step it has no
+        # improvement to look at, and ends only if gradient and decrement both are small.
+        small_gradient = scale * jnp.sqrt(islands.total(gradient**2, islands.dofs)) < tolerance
         decrement = -islands.total(gradient * direction, islands.dofs) / 2
-        near = jnp.maximum(scale * decrement, 0) < tolerance
+        small_decrement = jnp.maximum(scale * decrement, 0) < tolerance
         gain = scale * search.improvement
-        settled = flat | near | ((gain > 0) & (gain < tolerance))
-        going = search.going & ~jnp.where(search.steps == 0, flat & near, settled)
+        converged = small_gradient | small_decrement | ((gain > 0) & (gain < tolerance))
+        is_first = search.steps == 0
+        at_optimum = small_gradient & small_decrement
+        is_active = search.is_active & ~jnp.where(is_first, at_optimum, converged)
 
-        change, change_of_imbalance = problem.along(direction), inertia @ direction
+        # One line for each island: the Hessian couples no two, so that their lengths may differ.
+        change = problem.along(direction)
+        change_of_imbalance = inertia @ direction
         norm = jnp.sqrt(islands.total(direction**2, islands.dofs))
         slope = islands.total(direction * before.imbalance, islands.dofs)
         curvature = islands.total(direction * change_of_imbalance, islands.dofs)
-        at = _along(rows, islands, before.residual, change, slope, curvature)
-        flat_slope = tolerance * model.opt.ls_tolerance * norm / scale
-        end = _line_search(at, flat_slope, model.opt.ls_iterations)
-        length = jnp.where(going & (norm >= _TINY), end.length, 0)
-        of_dofs, of_rows = (islands.spread(length, labels) for labels in islands[1:])
+        mark_at = _along(rows, islands, before.residual, change, slope, curvature)
+        # ``gtol`` of ``PrimalSearch``.
+        slope_tolerance = tolerance * model.opt.ls_tolerance * norm / scale
+        best = _line_search(mark_at, slope_tolerance, model.opt.ls_iterations)
+        # A length of zero ends an island's search: it has converged, or there is no better point.
+        length = jnp.where(is_active & (norm >= _TINY), best.length, 0)
+        dof_length = islands.spread(length, islands.dofs)
+        row_length = islands.spread(length, islands.rows)
         after = newton.Point(
-            before.qacc + of_dofs * direction,
-            before.imbalance + of_dofs * change_of_imbalance,
-            before.residual + of_rows * change,
+            before.qacc + dof_length * direction,
+            before.imbalance + dof_length * change_of_imbalance,
+            before.residual + row_length * change,
         )
-        return _Search(after, -end.cost, search.steps + 1, going & (length != 0))
+        return _Search(after, -best.cost, search.steps + 1, is_active & (length != 0))
 
-    first = newton.start(model, data, problem)
+    start = newton.start(model, data, problem)
     if islands.size > 1:  # what no row holds is not the solver's
-        first = _released(data, islands, first)
+        start = _released(data, islands, start)
     zeros = jnp.zeros_like(scale)
-    end = jax.lax.while_loop(
-        lambda search: jnp.any(search.going) & (search.steps < model.opt.iterations),
+    search = jax.lax.while_loop(
+        lambda search: jnp.any(search.is_active) & (search.steps < model.opt.iterations),
         improve,
-        _Search(first, zeros, jnp.int32(0), zeros == 0),
+        _Search(start, zeros, jnp.int32(0), zeros == 0),
     )
-    return problem.solution(end.point)
+    return problem.solution(search.point)
 
 
 def _released(data: mjx.Data, islands: _Islands, point: newton.Point) -> newton.Point:
     """Returns a point with the unconstrained acceleration where there is no island."""
+    # As the end of C's ``warmstart``; there the imbalance is that of ``qacc_smooth``, zero.
     free = islands.dofs == islands.size
     qacc = jnp.where(free, data.qacc_smooth, point.qacc)
     return point._replace(qacc=qacc, imbalance=jnp.where(free, 0, point.imbalance))
@@ -180,29 +196,34 @@ def _released(data: mjx.Data, islands: _Islands, point: newton.Point) -> newton.
 def _islands(model: mjx.Model, jacobian: jax.Array) -> _Islands:
     """Returns the islands; a row joins the trees in which it is not zero [rows, nv]."""
     trees = model.dof_treeid
-    count = int(trees.max()) + 1
-    if count == 1 or model.opt.disableflags & _NO_ISLANDS:
+    num_trees = int(trees.max()) + 1
+    if num_trees == 1 or model.opt.disableflags & _NO_ISLANDS:
         return _Islands(1, np.zeros(len(trees), int), np.zeros(len(jacobian), int))
 
     def join(joined: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-        meets = jnp.stack([jnp.any(rows[:, trees == t] != 0, 1) for t in range(count)])
-        return joined | jnp.any(meets[:, None] & meets[None], -1), meets
+        """Joins trees [trees, trees] that rows hold together; returns which rows hold which."""
+        holds = jnp.stack([jnp.any(rows[:, trees == t] != 0, 1) for t in range(num_trees)])
+        return joined | jnp.any(holds[:, None] & holds[None], -1), holds
 
     # LLVM takes minutes for thousands of bools that are joined in one block.
-    parts = jacobian[:, None] if is_written_out() else jacobian[None]
-    joined, met = short_scan(join, jnp.zeros((count, count), bool), parts)
-    meets = jnp.moveaxis(met, 0, 1).reshape(count, -1)
-    for _ in range(math.ceil(math.log2(count))):  # through one more tree, three more, ...
+    blocks = jacobian[:, None] if is_written_out() else jacobian[None]
+    joined, block_holds = short_scan(join, jnp.zeros((num_trees, num_trees), bool), blocks)
+    holds = jnp.moveaxis(block_holds, 0, 1).reshape(num_trees, -1)
+    # The transitive closure, for which ``mj_island`` walks a graph: each squaring joins trees
+    # through one more tree, three more, ...
+    for _ in range(math.ceil(math.log2(num_trees))):
         joined = jnp.any(joined[:, :, None] & joined[None], 1)
-    label = jnp.min(jnp.where(joined, jnp.arange(count), count), 1)
-    of_rows = jnp.min(jnp.where(meets, label[:, None], count), 0)
-    return _Islands(count, label[trees], of_rows)
+    # An island's number is that of its first tree, so that many numbers name none.
+    label = jnp.min(jnp.where(joined, jnp.arange(num_trees), num_trees), 1)
+    row_label = jnp.min(jnp.where(holds, label[:, None], num_trees), 0)
+    return _Islands(num_trees, label[trees], row_label)
 
 
 def _scale(model: mjx.Model, inertia: jax.Array, islands: _Islands) -> jax.Array:
     """Returns what C multiplies costs and gradients by before it looks at them, [islands]."""
     if model.opt.disableflags & _NO_ISLANDS:
         return 1 / jnp.full(1, model.stat.meaninertia * max(1, model.nv), inertia.dtype)
+    # Numbers that name no island have a trace of zero.
     return 1 / jnp.maximum(islands.total(jnp.diagonal(inertia), islands.dofs), _TINY)
 
 
@@ -225,28 +246,31 @@ def _along(
       curvature: [islands] its second derivative.
     """
     if rows.loss is not None:  # of every row, as a loop takes one after the other
-        others = (0, residual.size - rows.loss.size)
-        rows = rows._replace(loss=jnp.pad(rows.loss, others, constant_values=jnp.inf))
+        num_lossless = residual.size - rows.loss.size
+        row_loss = jnp.pad(rows.loss, (0, num_lossless), constant_values=jnp.inf)
+        rows = rows._replace(loss=row_loss)
+    # A loop over rows would carry these along, and nothing here reads them.
     rows = rows._replace(jacobian=None, reference=None)
-    whole = rows, jnp.asarray(islands.rows), residual, change
+    all_rows = rows, jnp.asarray(islands.rows), residual, change
 
-    def at(length: jax.Array) -> _Mark:
+    def mark_at(length: jax.Array) -> _Mark:
+        """Returns the mark at a length of each island's step, as C's ``PrimalEval``."""
         if is_written_out():  # hundreds of rows, at seven places
-            none = jnp.zeros((3, *length.shape), residual.dtype)
-            one_by_one = jax.tree.map(lambda x: x[:, None], whole)
+            zeros = jnp.zeros((3, *length.shape), residual.dtype)
+            row_by_row = jax.tree.map(lambda x: x[:, None], all_rows)
             add = lambda sums, row: (sums + _of_rows(islands, length, *row), None)  # noqa: E731
-            worked, pushed, stiff = short_scan(add, none, one_by_one)[0]
+            work, push, stiffness = short_scan(add, zeros, row_by_row)[0]
         else:
-            worked, pushed, stiff = _of_rows(islands, length, *whole)
-        total = curvature + stiff
+            work, push, stiffness = _of_rows(islands, length, *all_rows)
+        total_curvature = curvature + stiffness
         return _Mark(
-            length,
-            length * (slope + length * curvature / 2) + worked,
-            slope + length * curvature - pushed,
-            jnp.where(total > 0, total, _TINY),
+            length=length,
+            cost=length * (slope + length * curvature / 2) + work,
+            slope=slope + length * curvature - push,
+            curvature=jnp.where(total_curvature > 0, total_curvature, _TINY),
         )
 
-    return at
+    return mark_at
 
 
 def _of_rows(
@@ -264,7 +288,8 @@ def _of_rows(
     step = islands.spread(length, labels) * change
     after = residual + step
     force = rows.force(after)
-    # The difference of two costs has no digits where a row stays what it is.
+    # The difference of two costs has no digits where a row stays what it is. There the force is
+    # linear in the step, and its mean gives the work, as in C's ``frictionCostDif``.
     work = jnp.where(
         rows.alike(after, residual),
         -(rows.force(residual) + force) * step / 2,
@@ -280,63 +305,85 @@ def _chosen(condition: jax.Array, yes: Any, no: Any) -> Any:
     return jax.tree.map(lambda y, n: jnp.where(condition, y, n), yes, no)
 
 
-def _line_search(at: Callable[[jax.Array], _Mark], flat: jax.Array, most: int) -> _Mark:
-    """Returns where C's line search ends, of each island.
+def _line_search(
+    mark_at: Callable[[jax.Array], _Mark], slope_tolerance: jax.Array, max_lengths: int
+) -> _Mark:
+    """Returns where C's line search (``PrimalSearch``) ends, of each island.
 
     It makes Newton steps along the line until the slope changes its sign. Then both ends of that
     interval move inwards, to the best of their next Newton steps and the middle.
 
     Args:
-      at: evaluates a length.
-      flat: [islands] a slope that is smaller counts as zero.
-      most: how many lengths it may evaluate, more or less: it looks after each round.
+      mark_at: evaluates a length.
+      slope_tolerance: [islands] a slope that is smaller counts as zero.
+      max_lengths: how many lengths it may evaluate, more or less: it looks after each round.
     """
-    zero = at(jnp.zeros_like(flat))
-    first = at(zero.next)
-    towards = jnp.where(first.slope < 0, 1, -1)
-    settled = (jnp.abs(first.slope) < flat) & ((first.length == 0) | (first.cost < 0))
+    zero = mark_at(jnp.zeros_like(slope_tolerance))
+    newton_step = mark_at(zero.next)
+    toward_root = jnp.where(newton_step.slope < 0, 1, -1)
+    converged = jnp.abs(newton_step.slope) < slope_tolerance
+    converged = converged & ((newton_step.length == 0) | (newton_step.cost < 0))
 
     def goes_on(state: tuple) -> jax.Array:
-        mark, _, evaluated, settled = state
-        return ~settled & (mark.slope * towards <= -flat) & (evaluated < most)
+        mark, _, evaluations, converged = state
+        before_root = ~converged & (mark.slope * toward_root <= -slope_tolerance)
+        return before_root & (evaluations < max_lengths)
 
     def follow(state: tuple) -> tuple:
-        mark, _, evaluated, settled = state
-        new = at(mark.next)
-        done = settled | ((jnp.abs(new.slope) < flat) & (new.cost < 0))
-        return _chosen(goes_on(state), (new, mark, evaluated + 1, done), state)
+        """Makes the next Newton step along the line, where an island's search goes on."""
+        mark, _, evaluations, converged = state
+        new = mark_at(mark.next)
+        converged = converged | ((jnp.abs(new.slope) < slope_tolerance) & (new.cost < 0))
+        return _chosen(goes_on(state), (new, mark, evaluations + 1, converged), state)
 
-    state = first, zero, jnp.full(flat.shape, 2, jnp.int32), settled
+    # C counts lengths one by one; two are evaluated above.
+    state = newton_step, zero, jnp.full(slope_tolerance.shape, 2, jnp.int32), converged
     state = jax.lax.while_loop(lambda state: jnp.any(goes_on(state)), follow, state)
-    last, before, evaluated, settled = state
+    last, previous, evaluations, converged = state
+    # The last two marks, between which the slope changes its sign: p1 and p2 in C.
     bracket = _Bracket(
-        ends=(last, before),
-        nexts=(at(last.next), last),
-        evaluated=evaluated + 1,
-        settled=settled | (evaluated >= most),
-        end=last,
+        ends=(last, previous),
+        nexts=(mark_at(last.next), last),
+        evaluations=evaluations + 1,
+        converged=converged | (evaluations >= max_lengths),
+        best=last,
     )
-    return _bracketed(at, flat, most, bracket)
+    return _bracketed(mark_at, slope_tolerance, max_lengths, bracket)
 
 
 def _bracketed(
-    at: Callable[[jax.Array], _Mark], flat: jax.Array, most: int, bracket: _Bracket
+    mark_at: Callable[[jax.Array], _Mark],
+    slope_tolerance: jax.Array,
+    max_lengths: int,
+    bracket: _Bracket,
 ) -> _Mark:
     """Returns where the line search ends, from a bracket; otherwise as ``_line_search``."""
 
     def goes_on(state: _Bracket) -> jax.Array:
-        return ~state.settled & (state.evaluated < most)
+        return ~state.converged & (state.evaluations < max_lengths)
 
     def narrow(state: _Bracket) -> _Bracket:
+        """Makes one round of C's bracketed search, where an island's goes on."""
         low, high = state.ends
-        middle = at((low.length + high.length) / 2)
+        middle = mark_at((low.length + high.length) / 2)
         candidates = *state.nexts, middle
-        is_flat, best = jnp.zeros(flat.shape, bool), middle
+
+        # Of the candidates with a slope of zero the one of least cost ends the search.
+        is_flat = jnp.zeros(slope_tolerance.shape, bool)
+        best = middle
         for mark in candidates:
-            better = (jnp.abs(mark.slope) < flat) & (~is_flat | (mark.cost < best.cost))
-            is_flat, best = is_flat | better, _chosen(better, mark, best)
-        ends, nexts, evaluated, stays = [], [], state.evaluated + 1, True
-        for end, following in zip(state.ends, state.nexts, strict=True):
+            is_root = jnp.abs(mark.slope) < slope_tolerance
+            is_better = is_root & (~is_flat | (mark.cost < best.cost))
+            is_flat = is_flat | is_better
+            best = _chosen(is_better, mark, best)
+
+        # ``updateBracket``: each end goes to the candidate on its side of the root that is nearest.
+        # Where neither moves, rounding has the rest, and C takes the middle.
+        ends = []
+        nexts = []
+        evaluations = state.evaluations + 1
+        is_stuck = True
+        for end, end_next in zip(state.ends, state.nexts, strict=True):
             new = end
             for mark in candidates:
                 same_side = mark.slope * new.slope > 0
@@ -344,13 +391,15 @@ def _bracketed(
                 new = _chosen(closer, mark, new)
             moved = new.slope != end.slope
             ends.append(new)
-            nexts.append(_chosen(moved, at(new.next), following))
-            evaluated, stays = evaluated + moved, stays & ~moved
-        made = _Bracket(tuple(ends), tuple(nexts), evaluated, is_flat | stays, best)
-        return _chosen(goes_on(state), made, state)
+            nexts.append(_chosen(moved, mark_at(new.next), end_next))
+            evaluations = evaluations + moved
+            is_stuck = is_stuck & ~moved
+        narrowed = _Bracket(tuple(ends), tuple(nexts), evaluations, is_flat | is_stuck, best)
+        return _chosen(goes_on(state), narrowed, state)
 
-    done = jax.lax.while_loop(lambda state: jnp.any(goes_on(state)), narrow, bracket)
-    low, high = done.ends
+    bracket = jax.lax.while_loop(lambda state: jnp.any(goes_on(state)), narrow, bracket)
+    # Out of lengths, C takes the end of least cost, or no step if neither lowers the cost.
+    low, high = bracket.ends
     best = _chosen(low.cost <= high.cost, low, high)
     best = _chosen(best.cost < 0, best, jax.tree.map(jnp.zeros_like, best))
-    return _chosen(done.settled, done.end, best)
+    return _chosen(bracket.converged, bracket.best, best)

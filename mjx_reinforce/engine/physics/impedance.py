@@ -20,14 +20,21 @@ from mjx_reinforce.engine.physics import mjx_internals
 _C: Any = mujoco
 #: Fields of a model that say how soft its constraints are.
 _SOLIMPS = (
-    *("dof_solimp", "eq_solimp", "geom_solimp", "jnt_solimp", "pair_solimp"),
-    *("tendon_solimp_lim", "tendon_solimp_fri"),
+    "dof_solimp",
+    "eq_solimp",
+    "geom_solimp",
+    "jnt_solimp",
+    "pair_solimp",
+    "tendon_solimp_lim",
+    "tendon_solimp_fri",
 )
 
 
 def make_constraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Makes the constraint rows: where every solimp rises, those of ``mjx.make_constraint``."""
-    return (mjx.make_constraint if _rises(model) else _with_falls)(model, data)
+    if _rises(model):
+        return mjx.make_constraint(model, data)
+    return _with_falls(model, data)
 
 
 def _rises(model: mjx.Model) -> bool:
@@ -47,6 +54,7 @@ def _impedance(model: mjx.Model, solref: jax.Array, solimp: jax.Array, pos: jax.
       pos: [] the distance.
     """
     stiffness, damping, rising = mjx_internals.kbi(model, solref, solimp, pos)
+    # C clips dmin and dmax (``getsolparam``); MJX also clips what is between them.
     low, high = jnp.clip(solimp[:2], _C.mjMINIMP, _C.mjMAXIMP)
     # A fall is the mirror image of the rise between the same two numbers.
     swapped = solimp.at[:2].set(solimp[1::-1])

@@ -30,6 +30,7 @@ def tendon_armature(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 def _coupled(model: mjx.Model) -> np.ndarray:
     """Returns where C's inertia matrix has entries, [nv, nv]."""
+    # Compressed rows of the lower triangle, ``mjData.M``.
     lower = np.zeros((model.nv, model.nv), bool)
     lower[np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind] = True
     return lower | lower.T
@@ -68,6 +69,7 @@ def euler(model: mjx.Model, data: mjx.Data, balanced: bool = True) -> mjx.Data:
     if model.opt.disableflags & mjx.DisableBit.EULERDAMP:
         return mjx.euler(model, data)
 
+    # ``mj_EulerSkip``: damping at the step's end makes the matrix M + h diag(B).
     damped = mjx.full_m(model, data) + jnp.diag(model.opt.timestep * model.dof_damping)
     force = data.qfrc_smooth + data.qfrc_constraint
 
@@ -84,11 +86,14 @@ def implicitfast(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     flies freely (``_free_bodies``) so is ``qfrc_bias``. Of other bodies C leaves out what the
     derivative has where the inertia matrix has nothing.
     """
+    # M - h dF/dv, for ``mjINT_IMPLICITFAST`` symmetric: without the derivative of ``qfrc_bias``.
     timestep = model.opt.timestep
     change = timestep * _velocity_derivative(model, data)
     force = data.qfrc_smooth + data.qfrc_constraint
     inertia = mjx.full_m(model, data)
     qacc = solve(inertia - jnp.where(_coupled(model), change, 0), force)
+    # A free body shares no entry with others: its six rows are solved again, with its gyroscopic
+    # forces, which make them unsymmetric.
     for body in _free_bodies(model):
         dofs = np.flatnonzero(model.dof_bodyid == body)
         block = (inertia - change)[dofs[:, None], dofs]
@@ -100,24 +105,27 @@ def implicitfast(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 def _velocity_derivative(model: mjx.Model, data: mjx.Data) -> jax.Array:
     """Returns the derivative of the actuators' and dampers' forces by velocity, [nv, nv]."""
+    # ``mjd_passive_vel``: of joints and tendons.
     fields = jax_fields(data)
     damping = (fields.ten_J.T * model.tendon_damping) @ fields.ten_J
     derivative = -jnp.diag(model.dof_damping) - damping
     if model.opt.disableflags & mjx.DisableBit.ACTUATION:
         return derivative
 
+    # ``mjd_actuator_vel``: a force is gain * signal + bias, of which both may depend on velocity.
     affine = model.actuator_gaintype == mjx.GainType.AFFINE
     gain = jnp.where(affine, model.actuator_gainprm[:, 2], 0)
     muscles = np.flatnonzero(model.actuator_gaintype == mjx.GainType.MUSCLE)
     if muscles.size:
-        by_speed = jax.vmap(jax.grad(mjx_internals.muscle_gain, argnums=1))(
+        muscle_gain = jax.vmap(jax.grad(mjx_internals.muscle_gain, argnums=1))(
             data.actuator_length[muscles],
             fields.actuator_velocity[muscles],
             jnp.asarray(model.actuator_lengthrange)[muscles],
             jnp.asarray(model.actuator_acc0)[muscles],
             model.actuator_gainprm[muscles],
         )
-        gain = gain.at[muscles].set(by_speed)
+        gain = gain.at[muscles].set(muscle_gain)
+    # The signal is the activation where an actuator has one: the last of its own.
     signal = data.ctrl
     if not model.opt.disableflags & mjx.DisableBit.CLAMPCTRL:
         limited = jnp.asarray(model.actuator_ctrllimited) != 0
@@ -127,6 +135,7 @@ def _velocity_derivative(model: mjx.Model, data: mjx.Data) -> jax.Array:
         signal = jnp.where(model.actuator_actadr == -1, signal, data.act[last])
     affine = model.actuator_biastype == mjx.BiasType.AFFINE
     rate = gain * signal + jnp.where(affine, model.actuator_biasprm[:, 2], 0)
+    # A force at an end of its range does not change with velocity; MJX counts it all the same.
     rate = jnp.where(_clamped(model, data), 0, rate)
     return derivative + (fields.actuator_moment.T * rate) @ fields.actuator_moment
 
@@ -138,41 +147,49 @@ def _clamped(model: mjx.Model, data: mjx.Data) -> jax.Array:
     other transmissions the ranges of the joints that they move do not count.
     """
 
-    def at_an_end(
+    def at_end(
         force: jax.Array, limited: np.ndarray, ends: jax.Array, slack: float = 0
     ) -> jax.Array:
+        """Returns which forces are at an end of their range, by a share of it as slack."""
         low, high = ends.T
         beyond = (force <= low + slack * jnp.abs(low)) | (force >= high - slack * jnp.abs(high))
         return beyond & (jnp.asarray(limited) != 0)
 
-    force, kind, target = data.actuator_force, model.actuator_trntype, model.actuator_trnid[:, :1]
-    joints = np.isin(kind, (mjx.TrnType.JOINT, mjx.TrnType.JOINTINPARENT))[:, None]
-    of_joint = joints & (target == np.arange(model.njnt))
-    of_tendon = (kind == mjx.TrnType.TENDON)[:, None] & (target == np.arange(model.ntendon))
-    joint = data.qfrc_actuator[model.jnt_dofadr]
+    # Which joint, [nu, njnt], or tendon, [nu, ntendon], an actuator moves.
+    force = data.actuator_force
+    trntype = model.actuator_trntype
+    target = model.actuator_trnid[:, :1]
+    moves_joint = np.isin(trntype, (mjx.TrnType.JOINT, mjx.TrnType.JOINTINPARENT))[:, None]
+    of_joint = moves_joint & (target == np.arange(model.njnt))
+    of_tendon = (trntype == mjx.TrnType.TENDON)[:, None] & (target == np.arange(model.ntendon))
+    joint_force = data.qfrc_actuator[model.jnt_dofadr]
     # A tendon's forces are scaled to its limit, and their sum is rounded.
     rounding = max(1e-10, 10 * float(jnp.finfo(force.dtype).eps))
-    own = at_an_end(force, model.actuator_forcelimited, model.actuator_forcerange)
-    at_joint = at_an_end(joint, model.jnt_actfrclimited, model.jnt_actfrcrange)
-    tendon = force @ of_tendon, model.tendon_actfrclimited, model.tendon_actfrcrange
-    at_tendon = of_tendon & at_an_end(*tendon, rounding)
-    return own | (of_joint & at_joint).any(1) | at_tendon.any(1)
+    actuator_at_end = at_end(force, model.actuator_forcelimited, model.actuator_forcerange)
+    joint_at_end = at_end(joint_force, model.jnt_actfrclimited, model.jnt_actfrcrange)
+    tendon_at_end = of_tendon & at_end(
+        force @ of_tendon, model.tendon_actfrclimited, model.tendon_actfrcrange, rounding
+    )
+    return actuator_at_end | (of_joint & joint_at_end).any(1) | tendon_at_end.any(1)
 
 
 def _free_bodies(model: mjx.Model) -> list[int]:
     """Returns the bodies whose free joint is alone in their tree; others may be fixed to them."""
-    alone = np.bincount(model.dof_treeid) == 6
-    adr = model.jnt_dofadr[model.jnt_type == mjx.JointType.FREE]
-    return model.dof_bodyid[adr[alone[model.dof_treeid[adr]]]].tolist()
+    is_alone = np.bincount(model.dof_treeid) == 6
+    dofadr = model.jnt_dofadr[model.jnt_type == mjx.JointType.FREE]
+    return model.dof_bodyid[dofadr[is_alone[model.dof_treeid[dofadr]]]].tolist()
 
 
 def _bias_derivative(model: mjx.Model, data: mjx.Data, body: int, dofs: np.ndarray) -> jax.Array:
     """Returns the derivative of a free body's ``qfrc_bias`` by its turning, [6, 3]."""
-    # With all that is fixed to it, about the center of mass.
+    # With all that is fixed to it, about the center of mass: ``crb`` has six entries of the
+    # inertia, three of mass times offset, and the mass.
     inertia = jax_fields(data).crb[body][np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])]
-    frame, arm = data.xmat[body].reshape(3, 3), data.subtree_com[body] - data.xpos[body]
+    frame = data.xmat[body].reshape(3, 3)
+    arm = data.subtree_com[body] - data.xpos[body]
 
     def bias(turning: jax.Array) -> jax.Array:
+        """Returns the centrifugal force in the world, and the torque in the body's frame, [6]."""
         spin = frame @ turning
         push = jax_fields(data).crb[body, 9] * jnp.cross(spin, jnp.cross(spin, arm))
         torque = jnp.cross(arm, push) + jnp.cross(spin, inertia @ spin)
@@ -183,6 +200,7 @@ def _bias_derivative(model: mjx.Model, data: mjx.Data, body: int, dofs: np.ndarr
 
 def _solve_in_halves(matrix: jax.Array, right: jax.Array) -> jax.Array:
     """Returns inv(matrix) right, [6], for a matrix [6, 6] whose first half is positive definite."""
+    # The first half is eliminated as a block: the second is left with its Schur complement.
     inverse = _inverse(matrix[:3, :3])
     across = matrix[3:, :3] @ inverse
     last = _inverse(matrix[3:, 3:] - across @ matrix[:3, 3:]) @ (right[3:] - across @ right[:3])
@@ -205,6 +223,7 @@ def solve(matrix: jax.Array, force: jax.Array) -> jax.Array:
 
 def _from_leaves(inertia: jax.Array, force: jax.Array) -> jax.Array:
     """Solves; the degrees of freedom [nv] of a body come after those of its parent."""
+    # Backwards, Cholesky's factor has entries only where the matrix has, and zeros are skipped.
     return _from_root(inertia[::-1, ::-1], force[::-1])[::-1]
 
 

@@ -33,7 +33,8 @@ def supports(model: mjx.Model, data: mjx.Data) -> bool:
 
     ``nl`` counts the rows of limits, which a flag may disable, also those of balls and tendons.
     """
-    fields, joints = jax_fields(data), _limited_joints(model)
+    fields = jax_fields(data)
+    joints = _limited_joints(model)
     only_limits = fields.efc_J.shape[0] == fields.nl == joints.size
     return only_limits and max(map(len, _coupled_rows(model, joints))) <= _MAX_ROWS_TOGETHER
 
@@ -42,7 +43,8 @@ def past_limit(model: mjx.Model, data: mjx.Data) -> jax.Array:
     """Returns whether some joint is past its limit [], by the same test as MJX's rows."""
     joints = _limited_joints(model)
     position = data.qpos[np.asarray(model.jnt_qposadr)[joints]]
-    low, high = model.jnt_range[joints, 0], model.jnt_range[joints, 1]
+    low = model.jnt_range[joints, 0]
+    high = model.jnt_range[joints, 1]
     distance = jnp.minimum(position - low, high - position) - model.jnt_margin[joints]
     # A NaN counts as reached, so that it gets to the acceleration as it does in MJX.
     return ~jnp.all(distance >= 0)
@@ -62,12 +64,14 @@ def solve_limits(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array
     fields = jax_fields(impedance.make_constraint(model, data))
     joints = _limited_joints(model)
     dofs = np.asarray(model.jnt_dofadr)[joints]
+    # A row's only entry: 1 at the lower limit, -1 at the upper one, 0 inside.
     sign = [fields.efc_J[i, dof] for i, dof in enumerate(dofs)]
     unit = jnp.eye(model.nv, dtype=data.qacc_smooth.dtype)
     # response[i] is inv(M) applied to row i, up to its sign.
     response = [inertia.inverse_times(model, data, unit[dof]) for dof in dofs]
     force: list[Any] = [None] * dofs.size
     for rows in _coupled_rows(model, joints):
+        # D A and -D b of the module's docstring: f = max(0, target - matrix f).
         matrix = [
             [fields.efc_D[i] * sign[i] * sign[j] * response[i][dofs[j]] for j in rows] for i in rows
         ]
@@ -100,18 +104,20 @@ def _complementary(matrix: list[list[Any]], target: list[Any]) -> list[Any]:
 
     Each set of active rows gives one candidate; the one that is consistent is taken.
     """
-    alone = [jnp.maximum(target[i], 0) / (1 + matrix[i][i]) for i in range(len(target))]
+    # With one row active, which is then as if it were alone, the other's force must be zero.
+    single = [jnp.maximum(target[i], 0) / (1 + matrix[i][i]) for i in range(len(target))]
     if len(target) == 1:
-        return alone
+        return single
     (a, b), (c, d) = matrix
-    first_suffices = target[1] - c * alone[0] <= 0
-    second_suffices = target[0] - b * alone[1] <= 0
+    first_suffices = target[1] - c * single[0] <= 0
+    second_suffices = target[0] - b * single[1] <= 0
+    # With both active they solve f + matrix f = target, by Cramer's rule.
     determinant = (1 + a) * (1 + d) - b * c
-    both = [
+    pair = [
         ((1 + d) * target[0] - b * target[1]) / determinant,
         ((1 + a) * target[1] - c * target[0]) / determinant,
     ]
     return [
-        jnp.where(first_suffices, alone[0], jnp.where(second_suffices, 0, both[0])),
-        jnp.where(first_suffices, 0, jnp.where(second_suffices, alone[1], both[1])),
+        jnp.where(first_suffices, single[0], jnp.where(second_suffices, 0, pair[0])),
+        jnp.where(first_suffices, 0, jnp.where(second_suffices, single[1], pair[1])),
     ]

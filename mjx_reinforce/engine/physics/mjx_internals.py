@@ -46,10 +46,12 @@ advance = forward._advance
 collider = collision_primitive.collider
 geom_pairs = collision_driver.geom_pairs
 has_collider = cast(Callable[[int, int], bool], collision_driver.has_collision_fn)
-make_frame, quat_mul_axis = math.make_frame, math.quat_mul_axis
+make_frame = math.make_frame
+quat_mul_axis = math.quat_mul_axis
 kbi = constraint._kbi
 muscle_gain = support.muscle_gain
-solve_m, tendon_dot = smooth.solve_m, smooth.tendon_dot
+solve_m = smooth.solve_m
+tendon_dot = smooth.tendon_dot
 Collision = collision_types.Collision
 GeomInfo = collision_types.GeomInfo
 
@@ -68,13 +70,14 @@ def check_lookup(function: Callable[..., Any], name: str) -> None:
     Raises:
       RuntimeError: it does not.
     """
+    # The code of functions that it defines is among its constants.
     code = inspect.unwrap(function).__code__
-    inner = [part for part in code.co_consts if isinstance(part, types.CodeType)]
-    if not any(name in part.co_names for part in (code, *inner)):
-        tested = " and ".join(f"{package}=={it}.*" for package, it in TESTED_VERSIONS.items())
+    nested = [const for const in code.co_consts if isinstance(const, types.CodeType)]
+    if not any(name in function_code.co_names for function_code in (code, *nested)):
+        versions = " and ".join(f"{package}=={tag}.*" for package, tag in TESTED_VERSIONS.items())
         raise RuntimeError(
             f"{function.__module__}.{function.__name__} does not look up {name}, which "
-            f"mjx_reinforce replaces: install {tested}, or adapt {__name__}"
+            f"mjx_reinforce replaces: install {versions}, or adapt {__name__}"
         )
 
 
@@ -89,8 +92,8 @@ check_lookup(scan.body_tree, "_nvmap")
 def geom_groups(model: mjx.Model) -> Iterator[tuple[int, int, int]]:
     """Yields for each pair of geoms that may meet the dimension of their contacts, and the two."""
     for key, pairs in collision_driver._geom_groups(model).items():
-        for first, second, _ in pairs:
-            yield int(key.condim), first, second
+        for geom1, geom2, _ in pairs:
+            yield int(key.condim), geom1, geom2
 
 
 def has_friction(model: mjx.Model) -> np.ndarray:
@@ -108,25 +111,30 @@ def wrap_points(
       data: its data after ``mjx.kinematics``.
       elements: [W] all of ``model.wrap_type`` that are geoms.
     """
-    of_model: Any = model._impl
-    before, geom, after = model.wrap_objid[elements + np.array([[-1], [0], [1]])]
+    # A geom is between two sites in ``wrap_objid``; ``wrap_prm`` is its side site, -1 if none.
+    fields: Any = model._impl
+    site1, geom, site2 = model.wrap_objid[elements + np.array([[-1], [0], [1]])]
     side = np.round(model.wrap_prm[elements]).astype(int)
-    sphere = model.wrap_type[elements] == mjx.WrapType.SPHERE
-    ends = data.site_xpos[before], data.site_xpos[after]
+    is_sphere = model.wrap_type[elements] == mjx.WrapType.SPHERE
+    ends = data.site_xpos[site1], data.site_xpos[site2]
     geoms = data.geom_xpos[geom], data.geom_xmat[geom], model.geom_size[geom, 0]
-    of_each = *ends, *geoms, data.site_xpos[side], side[:, None] >= 0, sphere
-    search = of_model.wrap_inside_maxiter, of_model.wrap_inside_tolerance
-    order, parts = [], []
+    arguments = *ends, *geoms, data.site_xpos[side], side[:, None] >= 0, is_sphere
+    search = fields.wrap_inside_maxiter, fields.wrap_inside_tolerance
+    # ``support.wrap`` asks in Python whether a tendon wraps inside, so that both kinds are computed
+    # apart, and then put back in their order.
+    order = []
+    wraps = []
     for inside in (False, True):
-        chosen = np.flatnonzero(of_model.is_wrap_inside == inside)
-        if chosen.size:
-            fixed = inside, *search, of_model.wrap_inside_z_init
-            wrap = jax.vmap(lambda *x, fixed=fixed: support.wrap(*x, *fixed))
-            parts.append(wrap(*(x[chosen] for x in of_each)))
-            order.append(chosen)
+        indices = np.flatnonzero(fields.is_wrap_inside == inside)
+        if indices.size:
+            static = inside, *search, fields.wrap_inside_z_init
+            wrap = jax.vmap(lambda *x, static=static: support.wrap(*x, *static))
+            wraps.append(wrap(*(x[indices] for x in arguments)))
+            order.append(indices)
     inverse = np.argsort(np.concatenate(order))
-    length, first, last = (jnp.concatenate(x)[inverse] for x in zip(*parts, strict=True))
-    return length.reshape(-1) >= 0, first, last
+    length, point1, point2 = (jnp.concatenate(x)[inverse] for x in zip(*wraps, strict=True))
+    # A tendon that misses its geom has a length of -1 on it.
+    return length.reshape(-1) >= 0, point1, point2
 
 
 _Colliders = dict[tuple[mjx.GeomType, mjx.GeomType], Callable[..., Any]]
@@ -159,6 +167,7 @@ def rows_with(kbi: Callable[..., Any]) -> Callable[[mjx.Model, mjx.Data], mjx.Da
 
 def _copy(function: Callable[..., Any], **meanings: Any) -> Callable[..., Any]:
     """Returns a copy of a function of MJX in which global names have other meanings."""
+    # Without MJX's decorators, which call the original.
     plain = inspect.unwrap(function)
     return types.FunctionType(plain.__code__, {**plain.__globals__, **meanings})
 
@@ -172,6 +181,7 @@ def data_with(functions: Callable[[_Colliders], _Colliders]) -> Callable[..., mj
     Returns:
       (model, device) -> data
     """
+    # MJX's function asks ``collision_driver`` for dimensions; the copy asks this stand-in.
     table = functions(dict(collision_driver._COLLISION_FUNC))
     make_condim = _copy(collision_driver.make_condim, _COLLISION_FUNC=table)
     driver = types.SimpleNamespace(make_condim=make_condim)
@@ -186,15 +196,18 @@ def fenced(fn: Callable[..., Any]) -> Callable[..., Any]:
     """Returns a function that traces MJX with a fence between levels."""
 
     @functools.wraps(fn)
-    def traced(*args: Any) -> Any:
+    def trace(*args: Any) -> Any:
+        """Calls the function with MJX's own name for a level replaced meanwhile."""
+        # The name is global to all threads. A thread that traces within another trace comes in.
         with _lock:
-            before, scan._nvmap = scan._nvmap, _fenced_level
+            outer_level = scan._nvmap
+            scan._nvmap = _fenced_level
             try:
                 return fn(*args)
             finally:
-                scan._nvmap = before
+                scan._nvmap = outer_level
 
-    return traced
+    return trace
 
 
 def _fenced_level(*inputs: Any) -> Any:

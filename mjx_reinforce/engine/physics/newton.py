@@ -38,7 +38,7 @@ from mjx_reinforce.engine.scalar import skippable
 #: An interval is narrow if its lower end is at least this share of its upper end.
 _NARROW = 0.999
 #: From the unconstrained acceleration the optimum may be more steps away than from a warm start.
-_FROM_COLD = 50
+_STEPS_FROM_COLD = 50
 # mjMINVAL: what C takes for zero.
 _MIN_TRACE = 1e-15
 
@@ -46,9 +46,9 @@ _MIN_TRACE = 1e-15
 class Rows(NamedTuple):
     """Constraint rows.
 
-    jacobian: J
-    reference: [rows] r
-    constraint_mass: [rows] D
+    jacobian: J, ``efc_J``
+    reference: [rows] r, ``efc_aref``
+    constraint_mass: [rows] D, ``efc_D``
     both_sides: [rows] whether a row is active on both sides
     loss: [rows of equality and friction loss, which come first] the most that each pushes, inf for
       equality; None if no row has friction loss
@@ -63,6 +63,7 @@ class Rows(NamedTuple):
     def active(self, residual: jax.Array) -> jax.Array:
         """Returns which rows push as springs at residuals [rows]; a NaN does, not to be lost."""
         pushes = self.both_sides | ~(residual >= 0)
+        # A row that slides has a linear cost: it adds to the gradient alone, not to the Hessian.
         return pushes if self.loss is None else pushes & (self.sliding(residual) == 0)
 
     def force(self, residual: jax.Array) -> jax.Array:
@@ -73,9 +74,10 @@ class Rows(NamedTuple):
     def sliding(self, residual: jax.Array) -> jax.Array:
         """Returns the forces [rows] of the rows that slide, 0 for others."""
         assert self.loss is not None
-        first = slice(self.loss.size)
-        slides = jnp.abs(self.constraint_mass[first] * residual[first]) >= self.loss
-        force = jnp.where(slides, -jnp.sign(residual[first]) * self.loss, 0)
+        # Rows of equality are among these, with an infinite loss: they never slide.
+        lossy = slice(self.loss.size)
+        slides = jnp.abs(self.constraint_mass[lossy] * residual[lossy]) >= self.loss
+        force = jnp.where(slides, -jnp.sign(residual[lossy]) * self.loss, 0)
         return jnp.pad(force, (0, residual.size - self.loss.size))
 
     def cost(self, residual: jax.Array) -> jax.Array:
@@ -83,17 +85,20 @@ class Rows(NamedTuple):
         cost = jnp.where(self.active(residual), self.constraint_mass * residual**2, 0)
         if self.loss is None:
             return cost
-        first = slice(self.loss.size)
-        beyond = 2 * jnp.abs(residual[first]) - self.loss / self.constraint_mass[first]
-        slides = self.sliding(residual)[first] != 0
-        return cost.at[first].add(jnp.where(slides, self.loss * beyond, 0))
+        # The linear branch of Huber's function (``frictionCost`` of C's solver), doubled; the
+        # quadratic one is zero there, since a row that slides is not active.
+        lossy = slice(self.loss.size)
+        beyond = 2 * jnp.abs(residual[lossy]) - self.loss / self.constraint_mass[lossy]
+        slides = self.sliding(residual)[lossy] != 0
+        return cost.at[lossy].add(jnp.where(slides, self.loss * beyond, 0))
 
-    def alike(self, one: jax.Array, other: jax.Array) -> jax.Array:
+    def alike(self, new: jax.Array, old: jax.Array) -> jax.Array:
         """Returns of each row whether its cost is the same quadratic function at two residuals."""
-        same = self.active(one) == self.active(other)
+        is_alike = self.active(new) == self.active(old)
         if self.loss is not None:
-            same &= self.sliding(one) == self.sliding(other)
-        return same
+            # A row may slide either way; both ways are inactive.
+            is_alike &= self.sliding(new) == self.sliding(old)
+        return is_alike
 
 
 class Point(NamedTuple):
@@ -128,25 +133,26 @@ class Problem(NamedTuple):
         return contact_rows.along(self.division, self.rows.jacobian, direction, self.touching)
 
     def solution(self, end: Point) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Returns the acceleration [nv] and the forces of joints [nv] and rows [rows]."""
-        force = self.rows.force(end.residual)
-        joint_force = contact_rows.weighted(
-            self.division, self.inertia, self.rows.jacobian, force, force
+        """Returns ``qacc`` [nv], ``qfrc_constraint`` [nv] and ``efc_force`` [rows] of a point."""
+        efc_force = self.rows.force(end.residual)
+        # Only J' force is read. The forces stand in for the mass, which says which contacts push.
+        qfrc_constraint = contact_rows.weighted(
+            self.division, self.inertia, self.rows.jacobian, efc_force, efc_force
         )[1]
-        return end.qacc, joint_force, force
+        return end.qacc, qfrc_constraint, efc_force
 
 
 class Search(NamedTuple):
     """The state of Newton's method.
 
     point: the acceleration reached, and what the next step needs of it
-    steps: [] how many were made
-    settled: [] whether the last step led to the minimum
+    steps: [] how many led there
+    converged: [] whether the last step led to the minimum
     """
 
     point: Any
     steps: jax.Array
-    settled: jax.Array
+    converged: jax.Array
 
 
 class Line(NamedTuple):
@@ -166,17 +172,17 @@ class _LineSearch(NamedTuple):
     low: [] the largest length known to have a negative derivative
     high: [] the smallest length known to have a positive derivative
     root: [] where the last line is zero
-    line: of the last length evaluated
-    evaluated: [] how many lengths were
-    settled: [] whether the last two lengths evaluated have the same line
+    line: of the last length
+    evaluations: [] how many lengths were evaluated
+    converged: [] whether the last two lengths have the same line
     """
 
     low: jax.Array
     high: jax.Array
     root: jax.Array
     line: Line
-    evaluated: jax.Array
-    settled: jax.Array
+    evaluations: jax.Array
+    converged: jax.Array
 
 
 def supports(model: mjx.Model) -> bool:
@@ -197,15 +203,20 @@ def solve_newton(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array
     Returns:
       The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
     """
-    problem = posed(model, data)
-    rows, inertia = problem.rows, problem.inertia
-    smallest = smallest_decrement(model, inertia)
+    problem = problem_of(model, data)
+    rows = problem.rows
+    inertia = problem.inertia
+    min_decrement = smallest_decrement(model, inertia)
 
     def improve(search: Search) -> Search:
+        """Makes one step of ``mj_solPrimal``: the direction, its length, and the new point."""
         before = search.point
         direction, gradient = newton_direction(problem, before)
         decrement = -jnp.dot(gradient, direction) / 2
-        change, change_of_imbalance = problem.along(direction), inertia @ direction
+        # A step changes imbalance and residual linearly: the line search and the new point need no
+        # products with M and J but these (Mv and Jv of ``PrimalSearch``).
+        change = problem.along(direction)
+        change_of_imbalance = inertia @ direction
         without_rows = Line(
             jnp.dot(direction, before.imbalance), jnp.dot(direction, change_of_imbalance)
         )
@@ -215,53 +226,60 @@ def solve_newton(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array
             before.imbalance + length * change_of_imbalance,
             before.residual + length * change,
         )
-        same = jnp.all(rows.alike(after.residual, before.residual))
-        settled = same | (decrement < smallest)
-        return Search(after, search.steps + 1, settled)
+        # With the same rows in the same states the cost is one quadratic function at both ends, of
+        # which this was the full Newton step: another would change nothing.
+        unchanged = jnp.all(rows.alike(after.residual, before.residual))
+        converged = unchanged | (decrement < min_decrement)
+        return Search(after, search.steps + 1, converged)
 
     return problem.solution(descend(model.opt.iterations, improve, start(model, data, problem)))
 
 
-def posed(model: mjx.Model, data: mjx.Data) -> Problem:
+def problem_of(model: mjx.Model, data: mjx.Data) -> Problem:
     """Returns the problem of data with its constraint rows made."""
     fields = jax_fields(data)
-    num_others = fields.ne + fields.nf + fields.nl
-    coupled = contact_rows.couplings(model)
-    division = contact_rows.blocks(num_others, fields.contact.dim, coupled)
+    # MuJoCo's order of rows: ne of equalities, nf of friction loss, nl of limits, then contacts.
+    num_contact_free = fields.ne + fields.nf + fields.nl
+    couplings = contact_rows.couplings(model)
+    division = contact_rows.blocks(num_contact_free, fields.contact.dim, couplings)
     # A NaN counts as touching, so that it gets to the acceleration.
     touching = ~(fields.contact.dist - fields.contact.includemargin >= 0)
     jacobian = contact_rows.with_bases(division, fields.efc_J, touching)
-    rows = Rows(jacobian, fields.efc_aref, fields.efc_D, *_kinds(data))
+    both_sides, loss = _kinds(data)
+    rows = Rows(jacobian, fields.efc_aref, fields.efc_D, both_sides, loss)
     return Problem(division, rows, mjx.full_m(model, data), touching)
 
 
 def start(model: mjx.Model, data: mjx.Data, problem: Problem) -> Point:
     """Returns the unconstrained acceleration, or the warm start if that is on and costs less."""
 
-    def at(qacc: jax.Array) -> Point:
+    def point_at(qacc: jax.Array) -> Point:
         imbalance = problem.inertia @ qacc - data.qfrc_smooth
         return Point(qacc, imbalance, problem.along(qacc) - problem.rows.reference)
 
-    cold = at(data.qacc_smooth)
+    cold_start = point_at(data.qacc_smooth)
     if model.opt.disableflags & mjx.DisableBit.WARMSTART:
-        return cold
-    warm = at(data.qacc_warmstart)
-    better = _cost(problem.rows, data, warm) < _cost(problem.rows, data, cold)
-    return jax.tree.map(lambda w, c: jnp.where(better, w, c), warm, cold)
+        return cold_start
+    # As ``warmstart`` of C's ``mj_fwdConstraint``; at a tie, or a NaN, the cold start.
+    warm_start = point_at(data.qacc_warmstart)
+    is_warm = _cost(problem.rows, data, warm_start) < _cost(problem.rows, data, cold_start)
+    return jax.tree.map(lambda w, c: jnp.where(is_warm, w, c), warm_start, cold_start)
 
 
 def _kinds(data: mjx.Data) -> tuple[jax.Array, jax.Array | None]:
     """Returns which rows [rows] are active on both sides, and ``Rows.loss``."""
     fields = jax_fields(data)
-    first = fields.ne + fields.nf
-    loss = fields.efc_frictionloss[:first].at[: fields.ne].set(jnp.inf) if fields.nf else None
-    return jnp.arange(fields.efc_D.size) < first, loss
+    num_two_sided = fields.ne + fields.nf
+    loss = None
+    if fields.nf:
+        loss = fields.efc_frictionloss[:num_two_sided].at[: fields.ne].set(jnp.inf)
+    return jnp.arange(fields.efc_D.size) < num_two_sided, loss
 
 
-def descend(most: int, improve: Callable[[Search], Search], start: Any) -> Any:
+def descend(max_steps: int, improve: Callable[[Search], Search], start: Any) -> Any:
     """Returns the point that Newton's method reaches from a start in so many steps."""
     return jax.lax.while_loop(
-        lambda search: ~search.settled & (search.steps < most),
+        lambda search: ~search.converged & (search.steps < max_steps),
         improve,
         Search(start, jnp.int32(0), jnp.array(False)),
     ).point
@@ -286,12 +304,14 @@ def newton_direction(problem: Problem, point: Point) -> tuple[jax.Array, jax.Arr
     rounding error.
     """
     rows = problem.rows
+    # The Hessian is M + J' D J over the active rows, as C's ``MakeHessian``; the gradient is the
+    # imbalance minus J' f, as ``PrimalUpdateGrad``.
     active_mass = jnp.where(rows.active(point.residual), rows.constraint_mass, 0)
-    force = rows.force(point.residual)
-    hessian, joint_force = contact_rows.weighted(
-        problem.division, problem.inertia, rows.jacobian, active_mass, force
+    efc_force = rows.force(point.residual)
+    hessian, qfrc_constraint = contact_rows.weighted(
+        problem.division, problem.inertia, rows.jacobian, active_mass, efc_force
     )
-    gradient = point.imbalance - joint_force
+    gradient = point.imbalance - qfrc_constraint
     return -solve(hessian, gradient), gradient
 
 
@@ -307,24 +327,28 @@ def _line_search(
       without_rows: the derivative along it that has no rows.
       max_rounds: lengths to evaluate at most.
     """
+    # Of each row once, for all lengths: what changes with the length is which rows count. C keeps
+    # the same two, and the cost, in the quadratics of ``PrimalPrepare``.
     row_slope = rows.constraint_mass * change * point.residual
     row_curvature = rows.constraint_mass * change**2
 
     def line(active: jax.Array, residual: jax.Array) -> Line:
+        """Returns the line of the rows in their states at a residual [rows]."""
         at_zero = without_rows.at_zero + jnp.sum(jnp.where(active, row_slope, 0))
-        if rows.loss is not None:
+        if rows.loss is not None:  # a row that slides adds the same slope at every length
             at_zero -= jnp.dot(rows.sliding(residual), change)
         return Line(at_zero, without_rows.rate + jnp.sum(jnp.where(active, row_curvature, 0)))
 
-    def at(length: jax.Array) -> Line:
+    def line_at(length: jax.Array) -> Line:
+        """Returns the line at a length []."""
         residual = point.residual + length * change
         pushes = rows.both_sides | (residual < 0)
         return line(pushes if rows.loss is None else rows.active(residual), residual)
 
-    return root(line(rows.active(point.residual), point.residual), at, max_rounds)
+    return root(line(rows.active(point.residual), point.residual), line_at, max_rounds)
 
 
-def root(first: Line, at: Callable[[jax.Array], Line], max_rounds: int) -> jax.Array:
+def root(start_line: Line, line_at: Callable[[jax.Array], Line], max_rounds: int) -> jax.Array:
     """Returns the length of a step at which the cost's derivative along it is zero, [].
 
     The derivative increases, and is linear as long as no row changes. Each round evaluates the root
@@ -333,56 +357,64 @@ def root(first: Line, at: Callable[[jax.Array], Line], max_rounds: int) -> jax.A
     is zero, and the length is 1.
 
     Args:
-      first: the line where the step starts.
-      at: length [] -> the line there.
+      start_line: the line where the step starts.
+      line_at: length [] -> the line there.
       max_rounds: lengths to evaluate at most.
     """
 
-    def evaluate(last: _LineSearch) -> _LineSearch:
-        outside = (last.root <= last.low) | (last.root >= last.high)
-        length = jnp.where(outside, (last.low + last.high) / 2, last.root)
-        wide = last.low < _NARROW * last.high
-        found = at(length)
-        root = jnp.where(found.rate > 0, -found.at_zero / found.rate, length)
-        moved = [(new < old) | (new > old) for new, old in zip(found, last.line, strict=True)]
+    def evaluate(search: _LineSearch) -> _LineSearch:
+        """Evaluates one length, and takes the part of the interval that holds the root."""
+        outside = (search.root <= search.low) | (search.root >= search.high)
+        length = jnp.where(outside, (search.low + search.high) / 2, search.root)
+        wide = search.low < _NARROW * search.high
+        line = line_at(length)
+        # A line that does not increase has no root: the direction is zero, or there is a NaN.
+        root = jnp.where(line.rate > 0, -line.at_zero / line.rate, length)
+        moved = [(new < old) | (new > old) for new, old in zip(line, search.line, strict=True)]
         return _LineSearch(
-            low=jnp.where(root > length, length, last.low),
-            high=jnp.where(root > length, last.high, length),
+            # The derivative increases: where the line's root is ahead it is negative at the length.
+            low=jnp.where(root > length, length, search.low),
+            high=jnp.where(root > length, search.high, length),
             root=root,
-            line=found,
-            evaluated=last.evaluated + 1,
+            line=line,
+            evaluations=search.evaluations + 1,
             # In the middle of a wide interval, the last line's root may not be the derivative's.
-            settled=~((outside & wide) | jnp.any(jnp.stack(moved))),  # a NaN does not move
+            converged=~((outside & wide) | jnp.any(jnp.stack(moved))),  # a NaN does not move
         )
 
     start = _LineSearch(
-        low=jnp.zeros_like(first.rate),
-        high=jnp.full_like(first.rate, jnp.inf),
-        root=jnp.ones_like(first.rate),  # a full Newton step
-        line=first,
-        evaluated=jnp.int32(0),
-        settled=jnp.array(False),
+        low=jnp.zeros_like(start_line.rate),
+        high=jnp.full_like(start_line.rate, jnp.inf),
+        root=jnp.ones_like(start_line.rate),  # a full Newton step
+        line=start_line,
+        evaluations=jnp.int32(0),
+        converged=jnp.array(False),
     )
     return jax.lax.while_loop(
-        lambda last: ~last.settled & (last.evaluated < max_rounds), evaluate, start
+        lambda search: ~search.converged & (search.evaluations < max_rounds), evaluate, start
     ).root
 
 
 def solve_in_loops(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Finds what ``solve_newton`` does, from the unconstrained acceleration."""
-    groups, inertia = _rows_by_contact(model, data), mjx.full_m(model, data)
-    smallest = smallest_decrement(model, inertia)
+    groups = _rows_by_contact(model, data)
+    inertia = mjx.full_m(model, data)
+    min_decrement = smallest_decrement(model, inertia)
 
     def improve(search: Search) -> Search:
+        """Makes the step of ``solve_newton``, of which every sum over rows is a loop here."""
         qacc, imbalance = search.point
         direction, decrement, residuals = _direction_in_loops(groups, inertia, *search.point)
         change_of_imbalance = inertia @ direction
         without_rows = Line(jnp.dot(direction, imbalance), jnp.dot(direction, change_of_imbalance))
         _, changes = _fold(lambda _, rows: (None, rows.jacobian @ direction), None, groups)
 
-        def line(length: jax.Array) -> Line:
-            def add(line: Line, one: tuple) -> tuple[Line, None]:
-                rows, residual, change = one
+        def line_at(length: jax.Array) -> Line:
+            """Returns the line at a length []."""
+
+            def add_contact(line: Line, contact: tuple) -> tuple[Line, None]:
+                """Adds to the line what the rows of one contact have."""
+                rows, residual, change = contact
                 active = rows.active(residual + length * change)
                 weighted = jnp.where(active, rows.constraint_mass * change, 0)
                 at_zero = line.at_zero + jnp.dot(weighted, residual)
@@ -390,28 +422,30 @@ def solve_in_loops(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Arr
                     at_zero -= jnp.dot(rows.sliding(residual + length * change), change)
                 return Line(at_zero, line.rate + jnp.dot(weighted, change)), None
 
-            return _fold(add, without_rows, groups, residuals, changes)[0]
+            return _fold(add_contact, without_rows, groups, residuals, changes)[0]
 
-        length = root(line(jnp.zeros_like(decrement)), line, model.opt.ls_iterations)
+        length = root(line_at(jnp.zeros_like(decrement)), line_at, model.opt.ls_iterations)
 
-        def compare(same: jax.Array, one: tuple) -> tuple[jax.Array, None]:
-            rows, residual, change = one
-            return same & jnp.all(rows.alike(residual + length * change, residual)), None
+        def compare(unchanged: jax.Array, contact: tuple) -> tuple[jax.Array, None]:
+            rows, residual, change = contact
+            return unchanged & jnp.all(rows.alike(residual + length * change, residual)), None
 
-        same, _ = _fold(compare, jnp.array(True), groups, residuals, changes)
+        unchanged, _ = _fold(compare, jnp.array(True), groups, residuals, changes)
         after = qacc + length * direction, imbalance + length * change_of_imbalance
-        return Search(after, search.steps + 1, same | (decrement < smallest))
+        return Search(after, search.steps + 1, unchanged | (decrement < min_decrement))
 
+    # At the unconstrained acceleration the imbalance M a - qfrc_smooth is zero.
     start = data.qacc_smooth, jnp.zeros_like(data.qacc_smooth)
-    qacc, _ = descend(max(model.opt.iterations, _FROM_COLD), improve, start)
+    qacc, _ = descend(max(model.opt.iterations, _STEPS_FROM_COLD), improve, start)
 
-    def push(joint_force: jax.Array, rows: Rows) -> tuple[jax.Array, jax.Array]:
+    def push(qfrc_constraint: jax.Array, rows: Rows) -> tuple[jax.Array, jax.Array]:
         residual = rows.jacobian @ qacc - rows.reference
         force = rows.force(residual)
-        return joint_force + rows.jacobian.T @ force, force
+        return qfrc_constraint + rows.jacobian.T @ force, force
 
-    joint_force, forces = _fold(push, jnp.zeros_like(qacc), groups)
-    return qacc, joint_force, jnp.concatenate([force.reshape(-1) for force in forces])
+    # The groups are in the order of the rows, and so is what they give.
+    qfrc_constraint, forces = _fold(push, jnp.zeros_like(qacc), groups)
+    return qacc, qfrc_constraint, jnp.concatenate([force.reshape(-1) for force in forces])
 
 
 def _rows_by_contact(model: mjx.Model, data: mjx.Data) -> list[Rows]:
@@ -420,13 +454,16 @@ def _rows_by_contact(model: mjx.Model, data: mjx.Data) -> list[Rows]:
     The arrays are [contacts, rows of a contact, ...]; the rows of no contact are as if of one.
     """
     fields = jax_fields(data)
-    others = fields.ne + fields.nf + fields.nl
-    division = contact_rows.blocks(others, fields.contact.dim, contact_rows.couplings(model))
+    num_contact_free = fields.ne + fields.nf + fields.nl
+    couplings = contact_rows.couplings(model)
+    division = contact_rows.blocks(num_contact_free, fields.contact.dim, couplings)
     both_sides, loss = _kinds(data)
     rows = fields.efc_J, fields.efc_aref, fields.efc_D, both_sides
-    contacts = zip(*(contact_rows.by_group(division, x) for x in rows), strict=True)
-    first = Rows(*(x[None, :others] for x in rows), loss=None if loss is None else loss[None])
-    return [first, *(Rows(*each) for each in contacts)]
+    groups = zip(*(contact_rows.by_group(division, x) for x in rows), strict=True)
+    contact_free = Rows(*(x[None, :num_contact_free] for x in rows))
+    if loss is not None:  # of equalities and friction loss, never of a contact's rows
+        contact_free = contact_free._replace(loss=loss[None])
+    return [contact_free, *(Rows(*group) for group in groups)]
 
 
 def _fold(step: Callable, start: Any, *groups: Sequence) -> tuple[Any, list]:
@@ -440,11 +477,13 @@ def _fold(step: Callable, start: Any, *groups: Sequence) -> tuple[Any, list]:
     Returns:
       The last state, and the results of each group.
     """
-    state, results = start, []
+    state = start
+    group_outputs = []
     for contacts in zip(*groups, strict=True):
-        state, made = lax.scan(step, state, contacts if len(groups) > 1 else contacts[0])
-        results.append(made)
-    return state, results
+        # With one list of groups, ``step`` takes what a contact has, not a tuple of one.
+        state, outputs = lax.scan(step, state, contacts if len(groups) > 1 else contacts[0])
+        group_outputs.append(outputs)
+    return state, group_outputs
 
 
 def _direction_in_loops(
@@ -455,23 +494,25 @@ def _direction_in_loops(
     See ``newton_direction``.
     """
 
-    def add(sums: tuple, rows: Rows) -> tuple[tuple, jax.Array]:
+    def add_contact(sums: tuple, rows: Rows) -> tuple[tuple, jax.Array]:
+        """Adds one contact's rows to the Hessian and the gradient; returns their residuals too."""
         residual = rows.jacobian @ qacc - rows.reference
-        mass = jnp.where(rows.active(residual), rows.constraint_mass, 0)
+        active_mass = jnp.where(rows.active(residual), rows.constraint_mass, 0)
 
-        def pushed() -> tuple:
+        def add_rows() -> tuple:
+            """Returns the Hessian + J' D J, and the gradient - J' f."""
             hessian, gradient = sums
-            weighted = rows.jacobian.T * mass
+            weighted = rows.jacobian.T * active_mass
             slope = gradient + weighted @ residual
             if rows.loss is not None:
                 slope -= rows.jacobian.T @ rows.sliding(residual)
             return hessian + weighted @ rows.jacobian, slope
 
         if rows.loss is not None:  # all rows may slide
-            return pushed(), residual
-        return skippable(jnp.any(mass != 0), pushed, sums), residual
+            return add_rows(), residual
+        return skippable(jnp.any(active_mass != 0), add_rows, sums), residual
 
-    (hessian, gradient), residuals = _fold(add, (inertia, imbalance), groups)
+    (hessian, gradient), residuals = _fold(add_contact, (inertia, imbalance), groups)
     direction = -_inverse_times(hessian, gradient)
     return direction, -jnp.dot(gradient, direction) / 2, residuals
 
@@ -483,17 +524,22 @@ def _inverse_times(matrix: jax.Array, right: jax.Array) -> jax.Array:
     place, so that all rounds are the same code.
     """
 
-    def eliminate(left: tuple, _: None) -> tuple[tuple, tuple]:
-        matrix, right = left
-        column, inverse = matrix[:, 0], 1 / matrix[0, 0]
+    def eliminate(system: tuple, _: None) -> tuple[tuple, tuple]:
+        """Eliminates the first unknown; returns the smaller system, padded, and its equation."""
+        matrix, right = system
+        column = matrix[:, 0]
+        inverse = 1 / matrix[0, 0]
         factors = column * inverse
-        matrix, rest = matrix - factors[:, None] * column, right - factors * right[0]
-        moved = jnp.pad(matrix[1:, 1:], (0, 1)), jnp.pad(rest[1:], (0, 1))
-        return moved, (factors[1:], right[0] * inverse)
+        matrix = matrix - factors[:, None] * column
+        remainder = right - factors * right[0]
+        # The zeros that move in at the end are of unknowns that are already eliminated.
+        smaller_system = jnp.pad(matrix[1:, 1:], (0, 1)), jnp.pad(remainder[1:], (0, 1))
+        return smaller_system, (factors[1:], right[0] * inverse)
 
-    def substitute(known: jax.Array, eliminated: tuple) -> tuple[jax.Array, None]:
-        factors, value = eliminated
-        return jnp.append(value - jnp.dot(factors, known[:-1]), known[:-1]), None
+    def substitute(solution: jax.Array, equation: tuple) -> tuple[jax.Array, None]:
+        factors, value = equation
+        return jnp.append(value - jnp.dot(factors, solution[:-1]), solution[:-1]), None
 
-    _, eliminated = lax.scan(eliminate, (matrix, right), None, len(right))
-    return lax.scan(substitute, jnp.zeros_like(right), eliminated, reverse=True)[0]
+    # The last unknown first; each one moves those after it down by a place.
+    _, equations = lax.scan(eliminate, (matrix, right), None, len(right))
+    return lax.scan(substitute, jnp.zeros_like(right), equations, reverse=True)[0]

@@ -21,43 +21,49 @@ _OF_CONTACTS = mjx.SensorType.TOUCH, mjx.SensorType.CONTACT
 _OF_FRAMES = mjx.SensorType.FRAMELINACC, mjx.SensorType.FRAMEANGACC
 #: What shows forces on bodies, or what follows from them.
 _OF_BODIES = (
-    *(mjx.SensorType.ACCELEROMETER, mjx.SensorType.FORCE, mjx.SensorType.TORQUE),
+    mjx.SensorType.ACCELEROMETER,
+    mjx.SensorType.FORCE,
+    mjx.SensorType.TORQUE,
     *_OF_FRAMES,
 )
 #: A type that no sensor has.
 _NO_TYPE = -1
 _FOR_SENSORS = "cacc", "cfrc_int", "cfrc_ext", "subtree_linvel", "subtree_angmom"
 #: What is computed only for sensors.
-Shown: TypeAlias = dict[str, Any]
+Readings: TypeAlias = dict[str, Any]
 
 
 def rne_postconstraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Computes cfrc_ext, cfrc_int and cacc, as ``mj_rnePostConstraint``."""
-    model, counted = _existing(model, data)
-    return _like(mjx.rne_postconstraint(model, _with_tendons(model, counted)), data)
+    model, existing = _existing(model, data)
+    return _like(mjx.rne_postconstraint(model, _with_tendons(model, existing)), data)
 
 
 def sensor_acc(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Computes the sensors of forces and accelerations, as ``mj_sensorAcc``."""
-    model, counted = _existing(model, data)
+    model, existing = _existing(model, data)
+    # These read ``cacc`` and ``cfrc_int``, for which MJX calls its ``rne_postconstraint``.
     if np.isin(model.sensor_type, _OF_BODIES).any():
-        counted = _with_tendons(model, counted)
-    if not jax_fields(counted).contact.dim.size:
-        kinds = np.where(np.isin(model.sensor_type, _OF_CONTACTS), _NO_TYPE, model.sensor_type)
-        model = model.replace(sensor_type=kinds)
-    return _like(_cut(model, mjx.sensor_acc(model, counted)), data)
+        existing = _with_tendons(model, existing)
+    # MJX fails on sensors of contacts where there can be none; left out, they show zero.
+    if not jax_fields(existing).contact.dim.size:
+        is_contact = np.isin(model.sensor_type, _OF_CONTACTS)
+        sensor_type = np.where(is_contact, _NO_TYPE, model.sensor_type)
+        model = model.replace(sensor_type=sensor_type)
+    return _like(_cut(model, mjx.sensor_acc(model, existing)), data)
 
 
 def _cut(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Returns the data with the accelerations of frames within their cutoffs."""
-    cut = np.isin(model.sensor_type, _OF_FRAMES) & (model.sensor_cutoff > 0)
-    if not cut.any():
+    has_cutoff = np.isin(model.sensor_type, _OF_FRAMES) & (model.sensor_cutoff > 0)
+    if not has_cutoff.any():
         return data
-    cutoff = np.repeat(np.where(cut, model.sensor_cutoff, np.inf), model.sensor_dim)
+    # A sensor has ``sensor_dim`` entries one after the other, and one cutoff for all.
+    cutoff = np.repeat(np.where(has_cutoff, model.sensor_cutoff, np.inf), model.sensor_dim)
     return data.replace(sensordata=jnp.clip(data.sensordata, -cutoff, cutoff))
 
 
-def shown(model: mjx.Model, data: mjx.Data) -> Shown:
+def readings(model: mjx.Model, data: mjx.Data) -> Readings:
     """Returns what is computed only for sensors; nothing if the model has none."""
     if not model.nsensor:
         return {}
@@ -65,26 +71,29 @@ def shown(model: mjx.Model, data: mjx.Data) -> Shown:
     return {"sensordata": data.sensordata, "fields": fields}
 
 
-def with_shown(data: mjx.Data, sensed: Shown) -> mjx.Data:
-    """Returns the data with what ``shown`` returned."""
-    if not sensed:
+def with_readings(data: mjx.Data, readings: Readings) -> mjx.Data:
+    """Returns the data with what ``readings`` returned."""
+    if not readings:
         return data
-    return with_fields(data.replace(sensordata=sensed["sensordata"]), **sensed["fields"])
+    return with_fields(data.replace(sensordata=readings["sensordata"]), **readings["fields"])
 
 
 def _like(computed: mjx.Data, data: mjx.Data) -> mjx.Data:
     """Returns what was computed, with the contacts and the forces that the data had."""
+    # What was changed for the computation alone: a loop's carry keeps its shape, and the next step
+    # its applied forces.
     contact = jax_fields(data).contact
     return with_contact(computed.replace(xfrc_applied=data.xfrc_applied), contact, contact.dim)
 
 
 def _existing(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Model, mjx.Data]:
     """Returns the model and data without the equalities and contacts whose flags are disabled."""
+    # MJX counts rows by the types of equalities and by the contacts, and finds forces of others.
     if model.opt.disableflags & _NO_EQUALITY:
         model = model.replace(eq_type=np.full_like(model.eq_type, _NO_TYPE))
     if model.opt.disableflags & _NO_CONTACT:
-        none = jax.tree.map(lambda x: x[:0], jax_fields(data).contact)
-        data = with_contact(data, none, none.dim[:0])
+        no_contacts = jax.tree.map(lambda x: x[:0], jax_fields(data).contact)
+        data = with_contact(data, no_contacts, no_contacts.dim[:0])
     return model, data
 
 

@@ -88,6 +88,7 @@ def step(
         return runge_kutta_4(model, data, evaluate)
     data = evaluate(data)
     if integrator == mjx.IntegratorType.EULER:
+        # A solver that stops before the optimum leaves forces that do not give ``qacc``.
         return inertia.euler(model, data, balanced=not early_stop.stops_early(model))
     if integrator == mjx.IntegratorType.IMPLICITFAST:
         return inertia.implicitfast(model, data)
@@ -104,6 +105,7 @@ def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = mjx.sensor_vel(model, data)
     data = mjx.fwd_actuation(model, data)
     data = inertia.fwd_acceleration(model, data)
+    # MJX leaves these sensors out where a model has no constraint rows.
     if jax_fields(data).efc_J.size == 0:
         return sensors.sensor_acc(model, data.replace(qacc=data.qacc_smooth))
     return sensors.sensor_acc(model, solve_constraints(model, data))
@@ -120,14 +122,18 @@ def solve_constraints(model: mjx.Model, data: mjx.Data) -> mjx.Data:
       The data with ``qacc``, ``qfrc_constraint`` and ``efc_force``.
     """
     fields = jax_fields(data)
+    solver = _solve_in_steps
     if limits.supports(model, data) and not early_stop.stops_early(model):
-        active, solver = limits.past_limit(model, data), limits.solve_limits
+        is_active = limits.past_limit(model, data)
+        solver = limits.solve_limits
     elif fields.ne or fields.nf:  # rows that are always active
-        active, solver = jnp.array(True), _solve_in_steps
+        is_active = jnp.array(True)
     else:
-        active, solver = _some_active(data), _solve_in_steps
-    qacc, joint_force, force = jax.lax.cond(
-        active,
+        is_active = _any_active(data)
+    # C has no rows for what is not active, and then copies ``qacc_smooth`` (``mj_fwdConstraint``).
+    # MJX has a fixed number of rows, of which those that are not active are zero.
+    qacc, qfrc_constraint, efc_force = jax.lax.cond(
+        is_active,
         lambda: solver(model, data),
         lambda: (
             data.qacc_smooth,
@@ -135,17 +141,19 @@ def solve_constraints(model: mjx.Model, data: mjx.Data) -> mjx.Data:
             jnp.zeros_like(fields.efc_force),
         ),
     )
-    return with_fields(data.replace(qacc=qacc, qfrc_constraint=joint_force), efc_force=force)
+    data = data.replace(qacc=qacc, qfrc_constraint=qfrc_constraint)
+    return with_fields(data, efc_force=efc_force)
 
 
-def _some_active(data: mjx.Data) -> jax.Array:
-    """Returns whether some row is active []: a touching contact, or another row that is not zero.
+def _any_active(data: mjx.Data) -> jax.Array:
+    """Returns whether any row is active []: a touching contact, or another row that is not zero.
 
     A NaN counts as active, so that it gets to the acceleration as it does in MJX.
     """
     fields = jax_fields(data)
-    others = jnp.any(fields.efc_J[: fields.ne + fields.nf + fields.nl] != 0)
-    return others | ~jnp.all(fields.contact.dist - fields.contact.includemargin >= 0)
+    num_contact_free = fields.ne + fields.nf + fields.nl
+    contact_free = jnp.any(fields.efc_J[:num_contact_free] != 0)
+    return contact_free | ~jnp.all(fields.contact.dist - fields.contact.includemargin >= 0)
 
 
 def _solve_in_steps(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -157,6 +165,7 @@ def _solve_in_steps(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Ar
     if not jax_fields(data).contact.dim.size:  # MJX's solver fails on elliptic cones of none
         model = model.replace(opt=model.opt.replace(cone=mjx.ConeType.PYRAMIDAL))
     if newton.supports(model) and early_stop.stops_early(model):
+        # The same search where contacts have no room: another one would stop elsewhere.
         return touching.solve_touching(early_stop.solve, early_stop.solve, model, data)
     if newton.supports(model):
         return touching.solve_touching(newton.solve_newton, newton.solve_in_loops, model, data)
@@ -174,38 +183,44 @@ def runge_kutta_4(
       data: its data, with ``ctrl`` set.
       evaluate: the model's forward pass, up to the acceleration.
     """
-    start, timestep = data, model.opt.timestep
+    start = data
+    timestep = model.opt.timestep
 
-    def follow(carry: tuple, row: jax.Array) -> tuple[tuple, sensors.Shown]:
+    def follow(carry: tuple, row: jax.Array) -> tuple[tuple, sensors.Readings]:
         """Evaluates a stage, adds its weighted rates, and moves from the start to the next."""
         stage, rate, sums = carry
         position, weight, next_position = row
+        # The loop's carry keeps its types, which MJX's forward pass does not.
         stage = like(evaluate(stage), stage)
         # The next stage's solver starts at this one's solution. C starts all four where the time
         # step did: the minimum is the same, after more steps (Humanoid, random actions: 1.9, not
         # 1.7). What stops before the minimum has to start there.
         if not early_stop.stops_early(model):
             stage = stage.replace(qacc_warmstart=stage.qacc)
-        shown = sensors.shown(model, stage)
+        readings = sensors.readings(model, stage)
+        # Rates are averaged where they add up: of one rotation vector since the start of the step,
+        # not of velocities in the stages' frames, which MJX averages.
         rate = _displacement_rate(model, stage.qvel, rate, position)
         rates = rate, stage.qacc, stage.act_dot
         sums = tuple(total + weight * x for total, x in zip(sums, rates, strict=True))
+        # Every stage starts where the step did, and goes on from there at this stage's rates.
         qvel, qacc, act_dot = (next_position * x for x in rates)
         advanced = advance(model, start.replace(qacc=qacc), act_dot, qacc, qvel)
+        # Activations go on without their clamp to ``actrange``, which ``advance`` has.
         stage = stage.replace(
             qpos=advanced.qpos,
             qvel=advanced.qvel,
             act=start.act + act_dot * timestep,
             time=start.time + next_position * timestep,
         )
-        return (stage, rate, sums), shown
+        return (stage, rate, sums), readings
 
     # A loop, so that XLA compiles one forward pass instead of four.
-    nothing = jax.tree.map(jnp.zeros_like, (data.qvel, data.qvel, data.act))
+    zero_sums = jax.tree.map(jnp.zeros_like, (data.qvel, data.qvel, data.act))
     rows = jnp.asarray(_STAGES, data.qpos.dtype)
-    (stage, _, sums), shown = jax.lax.scan(follow, (data, data.qvel, nothing), rows)
+    (stage, _, sums), readings = jax.lax.scan(follow, (data, data.qvel, zero_sums), rows)
     # In C the sensors show the first stage.
-    stage = sensors.with_shown(stage, jax.tree.map(lambda stages: stages[0], shown))
+    stage = sensors.with_readings(stage, jax.tree.map(lambda stages: stages[0], readings))
     end = stage.replace(qpos=start.qpos, qvel=start.qvel, act=start.act, time=start.time)
     qvel, qacc, act_dot = sums
     # The next step starts its solver at the last stage's acceleration, and shows the mean.
@@ -229,13 +244,14 @@ def _displacement_rate(
       position: [] the stage's place in the timestep, from 0 to 1.
     """
     rate = qvel
-    for kind, dof in zip(model.jnt_type, model.jnt_dofadr, strict=True):
-        if kind not in (mjx.JointType.FREE, mjx.JointType.BALL):
+    for joint_type, dof in zip(model.jnt_type, model.jnt_dofadr, strict=True):
+        if joint_type not in (mjx.JointType.FREE, mjx.JointType.BALL):
             continue
-        first = int(dof) + (3 if kind == mjx.JointType.FREE else 0)
-        turn = slice(first, first + 3)
-        rotation = position * model.opt.timestep * last_rate[turn]
-        rate = rate.at[turn].set(_rotation_rate(rotation, qvel[turn]))
+        # A free joint has three degrees of freedom of translation before those of rotation.
+        start = int(dof) + (3 if joint_type == mjx.JointType.FREE else 0)
+        turning = slice(start, start + 3)
+        rotation = position * model.opt.timestep * last_rate[turning]
+        rate = rate.at[turning].set(_rotation_rate(rotation, qvel[turning]))
     return rate
 
 
@@ -249,16 +265,19 @@ def _rotation_rate(rotation: jax.Array, velocity: jax.Array) -> jax.Array:
     c is singular at multiples of 2 pi, so that r is first replaced by the same rotation of an
     angle in (-pi, pi].
     """
+    # The angle in (-pi, pi]: small rotations stay as they are, to the last digit.
     square = jnp.sum(rotation**2)
     large = square > jnp.pi**2
     angle = jnp.sqrt(jnp.where(large, square, 1))
     excess = 2 * jnp.pi * jnp.floor(angle / (2 * jnp.pi) + 0.5)
     rotation = jnp.where(large, rotation * (1 - excess / angle), rotation)
+    # c is 0/0 at zero: a series there. Both are computed, and neither may be NaN.
     square = jnp.sum(rotation**2)
     small = square < _SMALL_SQUARE
-    safe = jnp.where(small, 1, square)
-    half = jnp.sqrt(safe) / 2
+    safe_square = jnp.where(small, 1, square)
+    half_angle = jnp.sqrt(safe_square) / 2
     series = sum(c * square**i for i, c in enumerate(_BORTZ_SERIES))
-    coefficient = jnp.where(small, series, (1 - half / jnp.tan(half)) / safe)
+    closed_form = (1 - half_angle / jnp.tan(half_angle)) / safe_square
+    coefficient = jnp.where(small, series, closed_form)
     across = jnp.cross(rotation, velocity)
     return velocity + across / 2 + coefficient * jnp.cross(rotation, across)

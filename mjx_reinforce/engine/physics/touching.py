@@ -28,10 +28,10 @@ Solver = Callable[..., Solution]
 #: Loops over more contacts are not written out, whatever the engine.
 _UNROLLABLE = 6
 #: Of so many contacts it is asked at once whether one of them touches.
-_AT_ONCE = 8
+_BATCH = 8
 
 
-def solve_touching(solver: Solver, rarely: Solver, model: mjx.Model, data: mjx.Data) -> Solution:
+def solve_touching(solver: Solver, fallback: Solver, model: mjx.Model, data: mjx.Data) -> Solution:
     """Solves with the contacts that touch, or with all where more touch than there is room for.
 
     Where those that there is room for have more than half of the rows, it is not worth the branches
@@ -39,17 +39,19 @@ def solve_touching(solver: Solver, rarely: Solver, model: mjx.Model, data: mjx.D
 
     Args:
       solver: what solves; it takes fewer contacts than the model has.
-      rarely: what solves where there is no room, which should be little code.
+      fallback: what solves where there is no room, which should be little code.
       model: an MJX model.
       data: with its constraint rows made.
     """
     contact = jax_fields(data).contact
-    kinds = [k for dim in (1, 3, 4, 6) if (k := np.flatnonzero(contact.dim == dim)).size]
-    room, rows = _room(model), jax_fields(data).efc_D.size
-    saved = sum(_rows_of_one(contact, kind) * max(0, kind.size - room) for kind in kinds)
-    if 2 * saved < rows or not is_written_out():
+    by_dim = [np.flatnonzero(contact.dim == dim) for dim in (1, 3, 4, 6)]
+    kinds = [kind for kind in by_dim if kind.size]
+    room = _room(model)
+    num_rows = jax_fields(data).efc_D.size
+    num_saved = sum(_rows_of_one(contact, kind) * max(0, kind.size - room) for kind in kinds)
+    if 2 * num_saved < num_rows or not is_written_out():
         return solver(model, data)
-    return _with_few(solver, rarely, model, data, kinds, room)
+    return _with_few(solver, fallback, model, data, kinds, room)
 
 
 def _room(model: mjx.Model) -> int:
@@ -63,7 +65,7 @@ def _room(model: mjx.Model) -> int:
 
 def _with_few(
     solver: Solver,
-    rarely: Solver,
+    fallback: Solver,
     model: mjx.Model,
     data: mjx.Data,
     kinds: list[np.ndarray],
@@ -72,34 +74,40 @@ def _with_few(
     """Solves; the kinds are the numbers of the contacts of each dimension."""
     contact = jax_fields(data).contact
     touching = ~(contact.dist - contact.includemargin >= 0)  # a NaN counts as touching
-    num_others = jax_fields(data).efc_D.size - sum(_rows_of_one(contact, k) * k.size for k in kinds)
+    num_contact_rows = sum(_rows_of_one(contact, kind) * kind.size for kind in kinds)
+    num_contact_free = jax_fields(data).efc_D.size - num_contact_rows
 
-    def few() -> Solution:
-        together = jax.tree.map(
-            lambda *x: jnp.concatenate(x), *(contacts for contacts, _ in packed)
-        )
-        dims = [np.full(min(k.size, room), contact.dim[k[0]]) for k in kinds]
+    def solve_few() -> Solution:
+        """Solves with the contacts that were packed, whose rows are made again, at their places."""
+        contacts = jax.tree.map(lambda *x: jnp.concatenate(x), *packed_contacts)
+        dims = [np.full(min(kind.size, room), contact.dim[kind[0]]) for kind in kinds]
         with contextlib.nullcontext() if room <= _UNROLLABLE else writing_out():
-            packed_data = with_contact(data, together, np.concatenate(dims))
-            qacc, joint_force, force = solver(model, make_constraint(model, packed_data))
-        parts, first = [force[:num_others]], num_others
+            packed_data = with_contact(data, contacts, np.concatenate(dims))
+            qacc, qfrc_constraint, force = solver(model, make_constraint(model, packed_data))
+        # Both branches return the forces of all rows, zero where no contact touches.
+        efc_force = [force[:num_contact_free]]
+        start = num_contact_free
         for kind in kinds:
             size = _rows_of_one(contact, kind)
-            last = first + size * min(kind.size, room)
-            parts.append(_unpack(force[first:last].reshape(-1, size), touching[kind]))
-            first = last
-        return qacc, joint_force, jnp.concatenate(parts)
+            stop = start + size * min(kind.size, room)
+            efc_force.append(_unpack(force[start:stop].reshape(-1, size), touching[kind]))
+            start = stop
+        return qacc, qfrc_constraint, jnp.concatenate(efc_force)
 
-    def every() -> Solution:
+    def solve_all() -> Solution:
         with writing_out():
-            return rarely(model, make_constraint(model, data))
+            return fallback(model, make_constraint(model, data))
 
-    def packed_kind(kind: np.ndarray) -> tuple[Any, jax.Array]:
-        return _pack(jax.tree.map(lambda x: x[kind], contact), touching[kind], room)
-
-    packed = [packed_kind(kind) for kind in kinds]
-    fits = jnp.all(jnp.stack([count for _, count in packed]) <= room)
-    return lax.cond(fits, few, every)
+    # Packed before the branch, which needs the counts.
+    packed_contacts = []
+    counts = []
+    for kind in kinds:
+        contacts = jax.tree.map(lambda x, kind=kind: x[kind], contact)
+        packed, count = _pack(contacts, touching[kind], room)
+        packed_contacts.append(packed)
+        counts.append(count)
+    fits = jnp.all(jnp.stack(counts) <= room)
+    return lax.cond(fits, solve_few, solve_all)
 
 
 def _rows_of_one(contact: Any, kind: np.ndarray) -> int:
@@ -121,35 +129,45 @@ def _pack(contacts: Any, touching: jax.Array, room: int) -> tuple[Any, jax.Array
     if touching.size <= room:
         return contacts, jnp.int32(0)
 
-    def look(state: tuple, one: tuple) -> tuple[tuple, None]:
-        contact, touches = one
+    def add_contact(state: tuple, row: tuple) -> tuple[tuple, None]:
+        """Puts a contact at the next place, if it touches."""
+        contact, touches = row
+        packed, count = state
 
         def put() -> tuple:
-            here = jnp.arange(room) == state[1]
-            place = lambda old, new: jnp.where(here.reshape(-1, *[1] * new.ndim), new, old)  # noqa: E731
-            return jax.tree.map(place, state[0], contact), state[1] + 1
+            # Past the last place nothing is written, but the count goes on: it says what fits.
+            is_place = jnp.arange(room) == count
+
+            def put_leaf(old: jax.Array, new: jax.Array) -> jax.Array:
+                return jnp.where(is_place.reshape(-1, *[1] * new.ndim), new, old)
+
+            return jax.tree.map(put_leaf, packed, contact), count + 1
 
         return lax.cond(touches, put, lambda: state), None
 
-    def look_at_some(state: tuple, some: tuple) -> tuple[tuple, None]:
-        """Looks at each of a few contacts, if one of them touches."""
+    def add_batch(state: tuple, batch: tuple) -> tuple[tuple, None]:
+        """Puts each of a batch of contacts at its place, if one of them touches."""
+        _, touches = batch
 
-        def look_at_each() -> tuple:
-            leaves, tree = jax.tree.flatten(some)
+        def add_each() -> tuple:
+            leaves, tree = jax.tree.flatten(batch)
             after = state
-            for one in zip(*leaves, strict=True):
-                after, _ = look(after, tree.unflatten(one))
+            for row in zip(*leaves, strict=True):
+                after, _ = add_contact(after, tree.unflatten(row))
             return after
 
-        return lax.cond(jnp.any(some[1]), look_at_each, lambda: state), None
+        return lax.cond(jnp.any(touches), add_each, lambda: state), None
 
-    apart = jax.tree.map(lambda x: jnp.broadcast_to(x[0], (room, *x.shape[1:])), contacts)
-    apart = apart.replace(dist=jnp.full(room, jnp.inf, contacts.dist.dtype))
-    start = apart, jnp.int32(0)
-    whole, rows = touching.size // _AT_ONCE * _AT_ONCE, (contacts, touching)
-    some = jax.tree.map(lambda x: x[:whole].reshape(-1, _AT_ONCE, *x.shape[1:]), rows)
-    rest = jax.tree.map(lambda x: x[whole:], rows)
-    return lax.scan(look, lax.scan(look_at_some, start, some)[0], rest)[0]
+    # Places without a contact hold one at an infinite distance: its rows are zeros.
+    empty = jax.tree.map(lambda x: jnp.broadcast_to(x[0], (room, *x.shape[1:])), contacts)
+    empty = empty.replace(dist=jnp.full(room, jnp.inf, contacts.dist.dtype))
+    start = empty, jnp.int32(0)
+    # In batches, most of which one test skips; then those that fill no batch.
+    num_batched = touching.size // _BATCH * _BATCH
+    rows = contacts, touching
+    batches = jax.tree.map(lambda x: x[:num_batched].reshape(-1, _BATCH, *x.shape[1:]), rows)
+    remainder = jax.tree.map(lambda x: x[num_batched:], rows)
+    return lax.scan(add_contact, lax.scan(add_batch, start, batches)[0], remainder)[0]
 
 
 def _unpack(values: jax.Array, touching: jax.Array) -> jax.Array:
@@ -157,9 +175,10 @@ def _unpack(values: jax.Array, touching: jax.Array) -> jax.Array:
     if touching.size == len(values):
         return values.reshape(-1)
 
-    def give(count: jax.Array, touches: jax.Array) -> tuple[jax.Array, jax.Array]:
+    # The order of ``_pack``: the n-th contact that touches is at place n.
+    def read(count: jax.Array, touches: jax.Array) -> tuple[jax.Array, jax.Array]:
         return lax.cond(
             touches, lambda: (count + 1, values[count]), lambda: (count, jnp.zeros_like(values[0]))
         )
 
-    return lax.scan(give, jnp.int32(0), touching)[1].reshape(-1)
+    return lax.scan(read, jnp.int32(0), touching)[1].reshape(-1)
