@@ -74,13 +74,15 @@ def make(id: str, /, **kwargs: object) -> "MujocoEnv":
       50
     """
     check_id(id)
-    entry, settings = (id, {}) if ":" in id else _TABLE[id]
+    # "module:Class" has no entry in the table: the id says where it is.
+    entry, settings = _TABLE.get(id, (id, {}))
     build = _import(id, entry)
     try:
         env = build(**(settings | kwargs))
     except BadEnvironmentError:
         raise
     except (Exception, SystemExit) as error:  # the user's code may raise anything
+        # A ValueError of our tasks is a message for the user; from a class of one's own it is not.
         if isinstance(error, ValueError) and ":" not in id:
             raise
         raise ValueError(f"cannot build the environment {id!r}: {checks.explain(error)}") from error
@@ -101,7 +103,8 @@ def make_set(id: str, words: Sequence[str] = ()) -> Any:
     if not words:
         return make(id)
     check_id(id)
-    task = _import(id, id if ":" in id else _TABLE[id][0])
+    entry, _ = _TABLE.get(id, (id, {}))
+    task = _import(id, entry)
     from mjx_reinforce.envs.settings import read_settings
 
     return make(id, **read_settings(task, words))
@@ -142,11 +145,12 @@ def make_vec(
     """
     from mjx_reinforce.engine.vector import environment  # loads JAX
 
-    made = make(env, **settings) if isinstance(env, str) else env
-    if made is env and settings:
+    if isinstance(env, str):
+        env = make(env, **settings)
+    elif settings:
         raise ValueError(f"{sorted(settings)} are for an id; this environment is made already")
     options: Any = {"autoreset": autoreset, "max_episode_steps": max_episode_steps}
-    return environment.make_vec(made, num_envs, engine=engine, **options)
+    return environment.make_vec(env, num_envs, engine=engine, **options)
 
 
 def _import(id: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:
@@ -158,6 +162,7 @@ def _import(id: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:
 
 def check_id(id: str) -> None:
     """Raises ValueError for an id that ``make`` does not know; imports nothing."""
+    # Before the form is checked, which would not say what is wrong with own_model.py:Crane.
     if re.search(r"\.py\b", id):
         raise ValueError(
             f"{id!r} is a file: write module:Class, such as own_model:Crane for the class Crane in "

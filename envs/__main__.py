@@ -37,6 +37,7 @@ def _print(settings: EnvsSettings) -> None:
     if settings.env is None:
         print("\n".join(envs.names()))
         return
+    # A name that is mistyped is refused before JAX is imported, which takes seconds.
     envs.check_id(settings.env)
     from mjx_reinforce.console.jax_setup import configure_jax
 
@@ -53,32 +54,36 @@ def about_task(id: str) -> str:
     Raises:
       ValueError: there is none, or it cannot be built.
     """
-    env, config = envs.make(id), of_task(id)
+    env = envs.make(id)
+    config = of_task(id)
     doc = inspect.cleandoc(type(env).__doc__ or "").replace("``", "`")
-    said = (" ".join(paragraph.split()) for paragraph in doc.split("\n\n") if paragraph)
+    # Each paragraph on one line, which ``say`` breaks at the width of the terminal.
+    paragraphs = (" ".join(paragraph.split()) for paragraph in doc.split("\n\n") if paragraph)
     train = f"{command('train')} --env {id}"
-    how = f"""To train {config.num_seeds} seeds for {config.env_steps:,} env steps each:
+    usage = f"""To train {config.num_seeds} seeds for {config.env_steps:,} env steps each:
 
   {train}
 
 --minutes M sets a time in place of env steps. --help shows the defaults."""
-    return "\n\n".join([id, _sizes(env), *said, *_settings(env), how])
+    return "\n\n".join([id, _sizes(env), *paragraphs, *_settings(env), usage])
 
 
 def _sizes(env: "MujocoEnv") -> str:
     """Returns the sizes of a task, a line each."""
     from mjx_reinforce.engine.base import observation_size
 
+    # A class of the user's own may have none of these.
     limit = getattr(env, "max_episode_steps", None)
     threshold = getattr(env, "reward_threshold", None)
     seconds = f", of {env.dt:g} s each" if hasattr(env, "dt") else ""
+    solved = "the task names no return"
+    if threshold is not None:
+        solved = f"at a return of {threshold:,g}"
     facts = {
         "observation": f"{observation_size(env)} numbers",
         "action": _action_in_words(env),
         "episode": f"at most {limit:,} env steps{seconds}" if limit else "give --horizon a number",
-        "solved": "the task names no return"
-        if threshold is None
-        else f"at a return of {threshold:,g}",
+        "solved": solved,
     }
     return "\n".join(f"  {name:11}  {fact}" for name, fact in facts.items())
 
@@ -99,15 +104,18 @@ def _as_text(value: object) -> str:
 
 
 def _action_in_words(env: "Environment") -> str:
+    """Returns how many numbers an action has and in which ranges, or how many actions there are."""
     from mjx_reinforce.engine.base import Discrete, action_space
 
     space = action_space(env)
     if isinstance(space, Discrete):
         return f"one of {space.num_actions}"
+    # Each range once, though many entries may have it.
     bounds = np.unique(np.stack([space.low, space.high], axis=1), axis=0)
     ranges = " or ".join(f"[{low:g}, {high:g}]" for low, high in bounds)
     count = len(space.low)
-    return f"{count} number{'s' * (count > 1)} in {ranges}"
+    noun = "numbers" if count > 1 else "number"
+    return f"{count} {noun} in {ranges}"
 
 
 if __name__ == "__main__":

@@ -51,10 +51,11 @@ class Physics:
 class Before(Named, Simulation):
     """What is known of the start of an env step, under MuJoCo's own names."""
 
-    def __init__(self, known: dict[str, jax.Array], mj_model: MjModel, episode: dict[str, Any]):
-        """Shows the given fields of mjData; any other raises AttributeError when it is read."""
-        vars(self).update(known)
-        self.mj_model, self.episode = mj_model, episode
+    def __init__(self, fields: dict[str, jax.Array], mj_model: MjModel, episode: dict[str, Any]):
+        """Shows these fields of mjData; any other raises AttributeError when it is read."""
+        vars(self).update(fields)
+        self.mj_model = mj_model
+        self.episode = episode
 
     def __getattr__(self, name: str) -> Any:
         raise AttributeError(
@@ -139,6 +140,7 @@ class MujocoEnv(Env):
         self._forward = jax.jit(functools.partial(_forward, self.model))
         self._physics_step = jax.jit(_step_of(self.model, self._forward))
         self._start = jax.jit(prune(self._forward_state))
+        # A range that is written without a limit counts for nothing in MuJoCo.
         low, high = np.array(self.mj_model.actuator_ctrlrange).T
         limited = np.array(self.mj_model.actuator_ctrllimited, bool)
         self.action_space = Box(np.where(limited, low, -np.inf), np.where(limited, high, np.inf))
@@ -188,7 +190,9 @@ class MujocoEnv(Env):
 
     def draw(self, rng: jax.Array) -> tuple[dict[str, jax.Array], tuple[jax.Array, jax.Array]]:
         """Returns what ``randomize`` and ``initial`` return, checked; consumes the key."""
-        name, episode = type(self).__name__, {}
+        name = type(self).__name__
+        episode = {}
+        # A task that draws nothing consumes no key for it, so that its starts are those of ``rng``.
         if type(self).randomize is not MujocoEnv.randomize:
             key, rng = jax.random.split(rng)
             episode = check_episode(name, self.randomize(key), self.model)
@@ -209,6 +213,8 @@ class MujocoEnv(Env):
         """
         check_shape("qpos", qpos, (self.mj_model.nq,))
         check_shape("qvel", qvel, (self.mj_model.nv,))
+        # Whether the physics stays whole is asked during tracing, and the jitted start may have
+        # been traced where it does not.
         start = self._forward_state if is_kept_whole() else self._start
         return start(qpos, qvel, episode or {})
 
@@ -217,6 +223,7 @@ class MujocoEnv(Env):
         fields = models.replaced(self.mj_model, episode)
         if not fields:
             return self._forward, self._physics_step
+        # Not jitted: they close over this episode's fields, so no trace could be used again.
         model = self.model.replace(**fields)
         forward = functools.partial(_forward, model)
         return forward, _step_of(model, forward)
@@ -232,7 +239,10 @@ class MujocoEnv(Env):
         else:
             forward, _ = self._physics_of(episode)
             data = physics.like(forward(start).replace(qpos=qpos), start)
-        state, view = self._physics(data, episode), View(data, self.mj_model, episode)
+        state = self._physics(data, episode)
+        view = View(data, self.mj_model, episode)
+        # No env step was made: the outcome says only which terms there are, each 0 so far. Wrappers
+        # and loops need a state of one structure from the first step on.
         zero = jnp.zeros((), qpos.dtype)
         action = jnp.zeros(self.action_size, qpos.dtype)
         terms = self._outcome(state, start, view, action)[2]
@@ -245,10 +255,12 @@ class MujocoEnv(Env):
         """
         check_shape("the action", action, (self.action_size,))
         before = cast(Any, state.pipeline_state)
+        # All else in mjData follows from what is carried, or stays as the model has it.
         start = models.make_data(self.mj_model).replace(**_carried(before))
         _, physics_step = self._physics_of(before.episode)
 
         def advance(_: int, carry: tuple[mjx.Data, jax.Array]) -> tuple[mjx.Data, jax.Array]:
+            """One physics step; sound until the first that C MuJoCo would not have made."""
             data, sound = carry
             data = physics.like(physics_step(data), data)
             return data, sound & _is_sound(data)
@@ -259,6 +271,7 @@ class MujocoEnv(Env):
         else:
             start_of_loop = start, jnp.array(True)
             data, sound = jax.lax.fori_loop(0, self.frame_skip, advance, start_of_loop)
+            # Once an env step, as Gymnasium's ``do_simulation`` calls it after the last mj_step.
             if self.contact_forces:
                 model = self.model.replace(**models.replaced(self.mj_model, before.episode))
                 data = sensors.rne_postconstraint(model, data)
@@ -288,22 +301,26 @@ class MujocoEnv(Env):
         paths, tree = jax.tree_util.tree_flatten_with_path(start)
         results = {jax.tree_util.keystr(path): leaf for path, leaf in paths}
         sound = jax.ShapeDtypeStruct((), bool)
-        given = [getattr(start, name) for name in ("ctrl", *models.CARRIED)]
-        made = whole(name, results | {"sound": sound}, *given, owner=hex(id(self)))
-        *leaves, is_sound = made.values()
+        operands = [getattr(start, field) for field in ("ctrl", *models.CARRIED)]
+        # The owner: by its address the engine knows whose model the operation is to simulate.
+        outputs = whole(name, results | {"sound": sound}, *operands, owner=hex(id(self)))
+        # In the order of ``results``, which is that of the tree's leaves; "sound" is the last.
+        *leaves, is_sound = outputs.values()
         return tree.unflatten(leaves), is_sound
 
     def _outcome(self, state: Physics, start: mjx.Data, data: View, action: jax.Array) -> Any:
         """Returns what ``outcome`` returns, or raises ValueError where it is no outcome."""
         constant = {name: getattr(start, name) for name in models.CONSTANT}
-        known = constant | state.carried | _carried(state)
-        before = Before(known, self.mj_model, state.episode)
+        # The state's own come last: a task may have asked to carry one of these, too.
+        fields = constant | state.carried | _carried(state)
+        before = Before(fields, self.mj_model, state.episode)
         return check_outcome(type(self).__name__, self.outcome(before, data, action))
 
     def _physics(self, data: mjx.Data, episode: dict[str, jax.Array]) -> Physics:
         """Returns what the next env step needs to know of a simulation."""
-        kept = {name: getattr(Simulation(data), name) for name in self.carried}
-        return Physics(**_carried(data), carried=kept, episode=episode)
+        # ``Simulation`` has MuJoCo's names, wherever MJX keeps the fields.
+        carried = {name: getattr(Simulation(data), name) for name in self.carried}
+        return Physics(**_carried(data), carried=carried, episode=episode)
 
     @property
     def dt(self) -> float:
@@ -353,7 +370,8 @@ class NearPose(MujocoEnv):
     def initial(self, rng):
         """Draws qpos [nq] around the model's pose and qvel [nv] around rest."""
         qpos_key, qvel_key = jax.random.split(rng)
-        model, noise = self.mj_model, self.settings.reset_noise_scale
+        model = self.mj_model
+        noise = self.settings.reset_noise_scale
         qpos = jax.random.uniform(qpos_key, (model.nq,), minval=-noise, maxval=noise)
         if self.normal_velocity:
             qvel = noise * jax.random.normal(qvel_key, (model.nv,))

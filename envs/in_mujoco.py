@@ -30,13 +30,15 @@ class _Recorder(View):
 
     def __init__(self, sizes: Simulation, mj_model: MjModel):
         super().__init__(None, mj_model, {})
-        self.sizes, self.read = sizes, set()
+        self.sizes = sizes
+        self.fields_read = set()
 
     def __getattr__(self, name: str) -> jax.Array:
+        """Returns zeros in the shape that MJX gives the field, and remembers its name."""
         shape = getattr(self.sizes, name)
         if not hasattr(shape, "dtype"):
             raise ValueError(f"the task reads {name}, which is not an array of mjData")
-        self.read.add(name)
+        self.fields_read.add(name)
         return jnp.zeros(shape.shape, shape.dtype)
 
 
@@ -56,32 +58,34 @@ class InMujoco:
           ValueError: the task has a ``reset`` or ``step`` of its own, or reads what C MuJoCo keeps
             in arrays of another size.
         """
-        own = type(env)
-        if not isinstance(env, MujocoEnv) or (own.reset, own.step) != (
-            MujocoEnv.reset,
-            MujocoEnv.step,
-        ):
-            raise ValueError(f"{own.__name__} has steps of its own, which MuJoCo does not know")
-        self.env, self.model, self.data = env, env.mj_model, _C.MjData(env.mj_model)
+        task = type(env)
+        methods = (MujocoEnv.reset, MujocoEnv.step)
+        if not isinstance(env, MujocoEnv) or (task.reset, task.step) != methods:
+            raise ValueError(f"{task.__name__} has steps of its own, which MuJoCo does not know")
+        self.env = env
+        self.model = env.mj_model
+        self.data = _C.MjData(env.mj_model)
         self._episode, _ = jax.eval_shape(env.draw, jax.random.key(0))
         self._sizes = Simulation(jax.eval_shape(lambda: models.make_data(env.mj_model)))
         recorder = _Recorder(self._sizes, env.mj_model)
 
+        # Which fields a task reads does not depend on their numbers: it is traced, as under jit.
         def read(before, episode, action):
             recorder.episode = episode
             outcome = env.outcome(self._view(before, episode), recorder, action)
             return outcome, env.observe(recorder)
 
-        jax.eval_shape(read, self._kept(), self._episode, jnp.zeros(env.action_size))
-        self._read = sorted(recorder.read)
+        jax.eval_shape(read, self._start_fields(), self._episode, jnp.zeros(env.action_size))
+        self._names = sorted(recorder.fields_read)
         self._fields()  # raises for those of another size
         self._start = jax.jit(env.draw)
-        self._observe = jax.jit(lambda *given: env.observe(self._view(*given)))
+        self._observe = jax.jit(lambda fields, episode: env.observe(self._view(fields, episode)))
         self._advance = jax.jit(self._outcome)
 
     def reset(self, rng: jax.Array) -> np.ndarray:
         """Begins an episode and returns its first observation [O]; consumes the key."""
         self._episode, (qpos, qvel) = self._start(rng)
+        # A copy, since an episode may replace fields of the model.
         self.model = model = copy.copy(self.env.mj_model)
         for name, value in models.replaced(model, self._episode).items():
             getattr(model, name)[:] = value
@@ -89,7 +93,8 @@ class InMujoco:
             for part in (model.body_sameframe, model.geom_sameframe, model.site_sameframe):
                 part[:] = int(_C.mjtSameFrame.mjSAMEFRAME_NONE)
         data = _C.MjData(model)
-        data.qpos[:], data.qvel[:] = qpos, qvel
+        data.qpos[:] = qpos
+        data.qvel[:] = qvel
         _C.mj_forward(model, data)
         self.data = data
         return np.asarray(self._observe(self._fields(), self._episode))
@@ -102,18 +107,22 @@ class InMujoco:
         Args:
           action: [A] as the policy gave it.
         """
-        before = self._kept()
+        before = self._start_fields()
         self.data.ctrl[:] = action
         _C.mj_step(self.model, self.data, self.env.frame_skip)
         if self.env.contact_forces:
             _C.mj_rnePostConstraint(self.model, self.data)
-        given = before, self._fields(), self._episode, np.asarray(action)
-        observation, reward, ended = self._advance(*given)
-        reward = np.nan if was_reset(self.data) else float(reward)
-        return np.asarray(observation), reward, bool(ended)
+        observation, reward, ended = self._advance(
+            before, self._fields(), self._episode, np.asarray(action)
+        )
+        # The task would pay for where MuJoCo has put the body back.
+        if was_reset(self.data):
+            reward = np.nan
+        return np.asarray(observation), float(reward), bool(ended)
 
     def _outcome(self, before, fields, episode, action):
-        data, before = self._view(fields, episode), self._view(before, episode)
+        data = self._view(fields, episode)
+        before = self._view(before, episode)
         reward, ended, _ = self.env.outcome(before, data, action)
         return self.env.observe(data), reward, ended
 
@@ -123,15 +132,17 @@ class InMujoco:
 
     def _fields(self) -> dict[str, np.ndarray]:
         """Returns what the task reads of the simulation, in the shapes that MJX has."""
-        return {name: self._field(name) for name in self._read}
+        return {name: self._field(name) for name in self._names}
 
-    def _kept(self) -> dict[str, np.ndarray]:
+    def _start_fields(self) -> dict[str, np.ndarray]:
         """Returns what the next outcome may read of the start of an env step."""
         names = (*models.CARRIED, *models.CONSTANT, *self.env.carried)
         return {name: self._field(name) for name in names}
 
     def _field(self, name: str) -> np.ndarray:
-        shape, value = getattr(self._sizes, name), np.array(getattr(self.data, name))
+        shape = getattr(self._sizes, name)
+        value = np.array(getattr(self.data, name))
+        # MJX has a fixed number of contacts and constraints, C those that there are.
         if value.size != np.prod(shape.shape, dtype=int):
             raise ValueError(f"the task reads {name}, whose size in MuJoCo changes")
         return value.reshape(shape.shape).astype(shape.dtype)

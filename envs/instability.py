@@ -12,8 +12,10 @@ from mjx_reinforce.envs.in_mujoco import was_reset
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco
-#: Simulated time (s), and how long that may take on the clock (s); a large model is tried for less.
-_SECONDS, _WAIT = 1.0, 0.04
+#: Simulated time (s).
+_SECONDS = 1.0
+#: How long that may take on the clock (s); a large model is tried for less.
+_WAIT = 0.04
 #: How long a random control acts (s of simulated time).
 _HOLD = 0.02
 
@@ -28,29 +30,31 @@ def instability(model: MjModel) -> str | None:
       A line on where C MuJoCo meets numbers that are NaN or beyond 1e10 and what helps, under no
       control or random ones in their range; None where it does not.
     """
-    said: list[str] = []
-    before = _C.get_mju_user_warning()
+    warning_texts: list[str] = []
+    handler = _C.get_mju_user_warning()
     # Else MuJoCo prints, and writes a file into the folder of the user.
-    _C.set_mju_user_warning(said.append)
+    _C.set_mju_user_warning(warning_texts.append)
     try:
         for kind, controls in (("no control", _zero(model)), ("random controls", _random(model))):
-            if (exploded := _play(model, controls)) is not None:
+            if (explosion := _play(model, controls)) is not None:
                 return (
                     f"this model is unstable in C MuJoCo itself: under {kind} it explodes after "
-                    f"{exploded}; try a smaller timestep, armature at the joints, "
+                    f"{explosion}; try a smaller timestep, armature at the joints, "
                     '<option integrator="implicitfast"/>, or softer servos'
                 )
     finally:
-        _C.set_mju_user_warning(before)
+        _C.set_mju_user_warning(handler)
     return None
 
 
 def _play(model: MjModel, controls: Iterator[np.ndarray]) -> str | None:
     """Returns after what time and where a model explodes under controls [A], if it does."""
-    data, end = _C.MjData(model), time.perf_counter() + _WAIT
+    data = _C.MjData(model)
+    deadline = time.perf_counter() + _WAIT
     if model.nkey:
         _C.mj_resetDataKeyframe(model, data, 0)
     timestep = model.opt.timestep
+    # Controls that change in every physics step would average out before anything moves.
     hold = max(1, round(_HOLD / timestep))
     for step in range(round(_SECONDS / timestep)):
         if step % hold == 0:
@@ -58,7 +62,7 @@ def _play(model: MjModel, controls: Iterator[np.ndarray]) -> str | None:
         _C.mj_step(model, data)
         if was_reset(data):
             return f"{step * timestep:.3g} s ({_place(model, data)})"
-        if time.perf_counter() > end:
+        if time.perf_counter() > deadline:
             break
     return None
 
@@ -68,13 +72,15 @@ def _place(model: MjModel, data: Any) -> str:
     kinds = _C.mjtWarning
     coordinate = data.warning[kinds.mjWARN_BADQPOS]
     if coordinate.number:
+        # The last joint whose coordinates begin at this one or before.
+        kind = "qpos"
         number = coordinate.lastinfo
         joint = int(np.searchsorted(model.jnt_qposadr, number, side="right")) - 1
     else:
+        kind = "DOF"
         speeds = data.warning[kinds.mjWARN_BADQVEL], data.warning[kinds.mjWARN_BADQACC]
         number = next(x.lastinfo for x in speeds if x.number)
         joint = int(model.dof_jntid[number])
-    kind = "qpos" if coordinate.number else "DOF"
     return f"{kind} {number}, joint {model.joint(joint).name or joint!r}"
 
 
@@ -87,7 +93,9 @@ def _zero(model: MjModel) -> Iterator[np.ndarray]:
 
 def _random(model: MjModel) -> Iterator[np.ndarray]:
     """Yields controls from all of their range; those without one are normal."""
-    rng, (low, high) = np.random.default_rng(0), _ranges(model)
+    rng = np.random.default_rng(0)
+    low, high = _ranges(model)
+    # Limits are infinite in pairs; a range that is not used is drawn as [0, 0].
     bounded = np.isfinite(low)
     while True:
         normal = rng.normal(size=model.nu)

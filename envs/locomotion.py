@@ -33,9 +33,12 @@ class Body(NearPose):
 
     def observe(self, data):
         """Returns qpos, without the place in the world if that is excluded, and qvel."""
-        excluded = self.settings.exclude_current_positions_from_observation
         velocity = jnp.clip(data.qvel, -self.max_velocity, self.max_velocity)
-        return jnp.concatenate([data.qpos[self.num_places if excluded else 0 :], velocity])
+        position = data.qpos
+        # The task is the same wherever the body is, so a policy need not see its place.
+        if self.settings.exclude_current_positions_from_observation:
+            position = position[self.num_places :]
+        return jnp.concatenate([position, velocity])
 
     def control_cost(self, action: jax.Array) -> jax.Array:
         """Returns what the action costs [], as the policy gave it: before actuators clamp it."""
@@ -68,17 +71,19 @@ class Runner(Body):
 
     def outcome(self, before, data, action):
         """Returns the sum of the terms, whether the episode ends, and the terms."""
+        # The mean over the env step (m/s), not the velocity at its end.
         velocity = (self.place(data) - self.place(before)) / self.dt
         terms = {
             "reward_forward": self.settings.forward_reward_weight * velocity[0],
             "reward_ctrl": -self.control_cost(action),
             **self.terms(data),
         }
-        where = {"x_position": data.qpos[0], "x_velocity": velocity[0]}
+        # Gymnasium's ``info``, which earns nothing.
+        info = {"x_position": data.qpos[0], "x_velocity": velocity[0]}
         if self.num_places == 2:
-            where |= {"y_position": data.qpos[1], "y_velocity": velocity[1]}
-            where["distance_from_origin"] = jnp.linalg.norm(data.qpos[:2])
-        return jnp.sum(jnp.stack(list(terms.values()))), self.terminated(data), terms | where
+            info |= {"y_position": data.qpos[1], "y_velocity": velocity[1]}
+            info["distance_from_origin"] = jnp.linalg.norm(data.qpos[:2])
+        return jnp.sum(jnp.stack(list(terms.values()))), self.terminated(data), terms | info
 
 
 class Healthy(Runner):

@@ -25,8 +25,16 @@ CARRIED = ("time", "qpos", "qvel", "act", "qacc_warmstart")
 CONSTANT = ("qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata")
 #: Fields of a model that ``MujocoEnv.randomize`` may replace in an episode.
 RANDOM = (
-    *("body_mass", "body_inertia", "body_ipos", "geom_friction", "dof_damping", "dof_armature"),
-    *("jnt_stiffness", "actuator_gainprm", "actuator_biasprm", "actuator_gear"),
+    "body_mass",
+    "body_inertia",
+    "body_ipos",
+    "geom_friction",
+    "dof_damping",
+    "dof_armature",
+    "jnt_stiffness",
+    "actuator_gainprm",
+    "actuator_biasprm",
+    "actuator_gear",
 )
 #: What no step depends on, and MJX refuses: the energy, and a check of the inverse dynamics.
 _ONLY_REPORTS = int(_C.mjtEnableBit.mjENBL_ENERGY | _C.mjtEnableBit.mjENBL_FWDINV)
@@ -56,6 +64,7 @@ def load_model(xml_file: ModelSource) -> Any:
             # HalfCheetah's total mass is given as Gymnasium gives it, which MuJoCo deprecates.
             warnings.filterwarnings("ignore", ".*'settotalmass' is deprecated")
             model = _compile_model(MjSpec.compile, spec(xml_file), xml_file)
+    # Said together with all that MJX would refuse, so that the file is mended once.
     if not model.nu:
         check_supported(model, _name(xml_file), "it has no actuators; add an <actuator> element")
     model.opt.enableflags &= ~_ONLY_REPORTS
@@ -80,10 +89,11 @@ def is_own(xml_file: ModelSource) -> bool:
     """Returns whether a model is the user's, by a path; raises ValueError where no file is."""
     if not isinstance(xml_file, str):
         return True
-    own = "/" in xml_file or "\\" in xml_file
-    if own and not Path(xml_file).is_file():
+    # Assets are named without a folder, whatever is in the current one.
+    is_path = "/" in xml_file or "\\" in xml_file
+    if is_path and not Path(xml_file).is_file():
         raise ValueError(f"there is no model {xml_file!r} in {Path.cwd()}")
-    return own
+    return is_path
 
 
 def spec(xml_file: ModelSource) -> Any:
@@ -127,11 +137,12 @@ def replaced(model: Any, episode: dict[str, Any]) -> dict[str, Any]:
     """
     fields = {name: value for name, value in episode.items() if name in RANDOM}
     if "body_mass" in fields:
-        inside = np.eye(model.nbody)  # [i, j]: whether body j is in the subtree of body i
-        for body in range(model.nbody - 1, 0, -1):  # parents come first
-            inside[model.body_parentid[body]] += inside[body]
+        in_subtree = np.eye(model.nbody)  # [i, j]: whether body j is in the subtree of body i
+        # From the leaves to the root: a parent's number is below those of its children.
+        for body in range(model.nbody - 1, 0, -1):
+            in_subtree[model.body_parentid[body]] += in_subtree[body]
         mass = fields["body_mass"]
-        fields["body_subtreemass"] = inside.astype(mass.dtype) @ mass
+        fields["body_subtreemass"] = in_subtree.astype(mass.dtype) @ mass
     return fields
 
 
@@ -168,7 +179,7 @@ def _without_idle_pairs(model: MjModel) -> MjModel:
     """Returns a model whose geoms meet none if a flag disables contacts: MJX looks at all pairs."""
     if may_touch(model):
         return model
-    apart = copy.copy(model)
-    apart.geom_contype[:] = 0
-    apart.geom_conaffinity[:] = 0
-    return apart
+    idle_model = copy.copy(model)
+    idle_model.geom_contype[:] = 0
+    idle_model.geom_conaffinity[:] = 0
+    return idle_model

@@ -30,9 +30,9 @@ def check_start(name: str, start: object, sizes: tuple[int, int]) -> tuple[Any, 
     """
     pair = start if isinstance(start, tuple | list) else ()
     require(len(pair) == 2, f"{name}.initial must return qpos and qvel, got {in_words(start)}")
-    for what, value, size in zip(("qpos", "qvel"), pair, sizes, strict=True):
-        said = f"{name}.initial must return {what} [{size}], as the model has it, got "
-        require(shape_of(value) == (size,), f"{said}{in_words(value)}")
+    for field, value, size in zip(("qpos", "qvel"), pair, sizes, strict=True):
+        rule = f"{name}.initial must return {field} [{size}], as the model has it"
+        require(shape_of(value) == (size,), f"{rule}, got {in_words(value)}")
     qpos, qvel = (jnp.asarray(x, jnp.result_type(x, float)) for x in pair)  # also of integers
     return qpos, qvel
 
@@ -49,8 +49,8 @@ def check_episode(name: str, episode: object, model: MjModel) -> dict[str, jax.A
       ValueError: it is something else, or replaces what cannot be replaced.
     """
     named = isinstance(episode, dict) and all(isinstance(key, str) for key in episode)
-    said = f"{name}.randomize must return a dict of quantities by their names"
-    require(named, f"{said}, got {in_words(episode)}")
+    rule = f"{name}.randomize must return a dict of quantities by their names"
+    require(named, f"{rule}, got {in_words(episode)}")
     arrays: dict[str, jax.Array] = {}
     for key, value in dict(cast(Any, episode)).items():
         quantity = f"{key!r} of {name}.randomize"
@@ -61,6 +61,7 @@ def check_episode(name: str, episode: object, model: MjModel) -> dict[str, jax.A
             f"{', '.join(RANDOM)}; a quantity of another kind needs another name",
         )
         arrays[key] = jnp.asarray(value)
+        # In the model's dtype: one field in float64 would make all physics of the episode so.
         if key in RANDOM:
             field = getattr(model, key)
             check_shape(quantity, value, field.shape)
@@ -85,10 +86,13 @@ def check_centers(
     Raises:
       UnsupportedError: it does.
     """
+    # The check is made while ``draw`` is traced, but it needs numbers.
     with jax.ensure_compile_time_eval():
         keys = jax.random.split(jax.random.key(0), _DRAWS)
         drawn = np.asarray(jax.vmap(lambda key: jnp.asarray(randomize(key)["body_ipos"]))(keys))
     moved = np.any(drawn != np.asarray(center), axis=(0, 2))
+    # body_simple is 1 where MuJoCo takes the body's block of the inertia matrix to be diagonal. The
+    # block of one degree of freedom is a single number, which has its place.
     fixed = np.flatnonzero(moved & (model.body_simple == 1) & (model.body_dofnum > 1))
     if fixed.size:
         names = ", ".join(model.body(int(body)).name or f"number {body}" for body in fixed)
@@ -108,17 +112,21 @@ def check_outcome(name: str, outcome: object) -> tuple[Any, Any, dict[str, Any]]
     Raises:
       ValueError: it is something else.
     """
-    three: Any = outcome if isinstance(outcome, tuple | list) else ()
+    triple: Any = outcome if isinstance(outcome, tuple | list) else ()
     require(
-        len(three) == 3,
+        len(triple) == 3,
         f"{name}.outcome must return three values, the reward, whether the episode ended, and "
         f"a dict of the reward's terms, got {in_words(outcome)}",
     )
-    reward, terminated, terms = three
-    said = f"the third value of {name}.outcome must be a dict of the reward's terms, got "
-    require(isinstance(terms, dict), f"{said}{in_words(terms)}")
-    named = {f"term {key!r}": value for key, value in terms.items()}
-    for what, value in {"reward": reward, "termination": terminated, **named}.items():
-        said = f"the {what} of {name}.outcome must be a scalar [], got {in_words(value)}; "
-        require(shape_of(value) == (), f"{said}sum it, or take an entry")
+    reward, terminated, terms = triple
+    rule = f"the third value of {name}.outcome must be a dict of the reward's terms"
+    require(isinstance(terms, dict), f"{rule}, got {in_words(terms)}")
+    # A reward [1] would broadcast in silence, and give all that follows an axis more.
+    scalars = {f"term {key!r}": value for key, value in terms.items()}
+    for quantity, value in {"reward": reward, "termination": terminated, **scalars}.items():
+        rule = f"the {quantity} of {name}.outcome must be a scalar []"
+        require(
+            shape_of(value) == (),
+            f"{rule}, got {in_words(value)}; sum it, or take an entry",
+        )
     return reward, terminated, terms

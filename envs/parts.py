@@ -31,24 +31,34 @@ class Part:
         """Finds the part; raises ValueError for a name that the model has not."""
         size, self._prefix = _KINDS[kind]
         names = [getattr(model, kind)(i).name for i in range(getattr(model, size))]
+        # A message lists the names that there are; parts without one have an empty name.
         check_name(kind, name, dict.fromkeys(filter(None, names)))
-        self._data, self._model, self._kind, self.id = data, model, kind, names.index(name)
+        self._data = data
+        self._model = model
+        self._kind = kind
+        self.id = names.index(name)
 
     def __getattr__(self, field: str) -> jax.Array:
-        data, model = self._data, self._model
+        """Returns the part's rows of a field: one, or of a joint or sensor as many as it has."""
+        # One row of xanchor or xaxis, but several of qpos, or of a field of the degrees of freedom.
         if self._kind == "joint" and field not in _OF_JOINTS:
-            return getattr(data, field)[self._rows(field)]
-        rows = getattr(data, field if field == "ctrl" else f"{self._prefix}{field}")
+            return getattr(self._data, field)[self._rows(field)]
+        # The controls are the only field of actuators without a prefix.
+        full_name = "ctrl" if field == "ctrl" else f"{self._prefix}{field}"
+        rows = getattr(self._data, full_name)
         if self._kind == "sensor":
-            start, size = int(model.sensor_adr[self.id]), int(model.sensor_dim[self.id])
-            return rows[start : start + size]
+            start = int(self._model.sensor_adr[self.id])
+            return rows[start : start + int(self._model.sensor_dim[self.id])]
         return rows[self.id]
 
     def _rows(self, field: str) -> slice:
         """Returns the rows of a joint in ``qpos``, or in a field of the degrees of freedom."""
-        model = self._model
-        of_qpos = model.jnt_qposadr, model.nq
-        starts, size = of_qpos if field == "qpos" else (model.jnt_dofadr, model.nv)
+        # A quaternion has four numbers in qpos, but three velocities: nq and nv differ.
+        starts = self._model.jnt_dofadr
+        size = self._model.nv
+        if field == "qpos":
+            starts = self._model.jnt_qposadr
+            size = self._model.nq
         ends = [*starts[1:], size]
         return slice(int(starts[self.id]), int(ends[self.id]))
 
@@ -102,4 +112,5 @@ class View(Named, Simulation):
     def __init__(self, data: Any, mj_model: MjModel, episode: dict[str, Any]):
         """Shows an ``mjx.Data``."""
         super().__init__(data)
-        self.mj_model, self.episode = mj_model, episode
+        self.mj_model = mj_model
+        self.episode = episode

@@ -18,7 +18,9 @@ from mjx_reinforce.engine.physics.mjx_internals import (
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco
-_GEOM, _DISABLED, _ENABLED = _C.mjtGeom, _C.mjtDisableBit, _C.mjtEnableBit
+_GEOM = _C.mjtGeom
+_DISABLED = _C.mjtDisableBit
+_ENABLED = _C.mjtEnableBit
 #: What MJX does not carry: its size in the model, what it is, and how to do without.
 NOT_CARRIED = {
     "history": ("nhistory", "delays", "remove delay and interval from actuators and sensors"),
@@ -88,19 +90,20 @@ class UnsupportedError(BadEnvironmentError):
     """
 
 
-def check_supported(model: MjModel, name: str, *others: str) -> None:
+def check_supported(model: MjModel, name: str, *faults: str) -> None:
     """Checks that a model can be simulated as by C MuJoCo.
 
     Args:
       model: the compiled model.
       name: what a message calls it.
-      others: what else is wrong with it, each with its remedy.
+      *faults: what else is wrong with it, each with its remedy.
 
     Raises:
       UnsupportedError: it cannot; the message has every reason, each with its remedy.
     """
-    unlike = dict.fromkeys(f"{what}; {remedy}" for what, remedy in _reasons(model))
-    reasons = [*others, *unlike]
+    # Keys of a dict, so that no sentence stands twice.
+    differences = dict.fromkeys(f"{feature}; {remedy}" for feature, remedy in _reasons(model))
+    reasons = [*faults, *differences]
     if len(reasons) == 1:
         raise UnsupportedError(f"MJX cannot run {name}: {reasons[0]}")
     if reasons:
@@ -115,8 +118,9 @@ def is_off(model: MjModel, flag: str) -> bool:
 
 def may_touch(model: MjModel) -> bool:
     """Returns whether some geoms of a model can push each other."""
-    off = is_off(model, "contact") or is_off(model, "constraint")
-    return not off and any(True for _ in geom_pairs(model))
+    # Without constraints C makes no contacts, either.
+    is_disabled = is_off(model, "contact") or is_off(model, "constraint")
+    return not is_disabled and any(True for _ in geom_pairs(model))
 
 
 def _reasons(model: MjModel) -> Iterator[tuple[str, str]]:
@@ -133,30 +137,32 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
     for field, feature, remedy in (*NOT_CARRIED.values(), *_IGNORED):
         if np.any(getattr(model, field)):
             yield feature, remedy
+    # Joints and tendons with a lower and an upper limit; a ball's limit is one angle. MJX has one
+    # row for both limits, C a row for each that is nearer than the margin.
     scalar = model.jnt_type != _C.mjtJoint.mjJNT_BALL
     for kind, limited, ends, margin in (
         ("joint", model.jnt_limited & scalar, model.jnt_range, model.jnt_margin),
         ("tendon", model.tendon_limited, model.tendon_range, model.tendon_margin),
     ):
-        both = np.flatnonzero(limited & (np.ptp(ends, axis=1) < 2 * margin))
-        if both.size:
-            names = _listed([getattr(model, kind)(i).name or f"number {i}" for i in both])
+        narrow = np.flatnonzero(limited & (np.ptp(ends, axis=1) < 2 * margin))
+        if narrow.size:
+            names = _listed([getattr(model, kind)(i).name or f"number {i}" for i in narrow])
             remedy = "give it a margin of at most half of its range"
             yield f"one of two limits that a {kind} meets at once ({names})", remedy
     refs = (getattr(model, of.format("solref")) for of in _STIFF)
     if any(np.any((ref[:, 0] > 0) != (ref[:, 1] > 0)) for ref in refs):
-        signs = "give two positive numbers, or two that are not"
-        yield "MuJoCo's default in place of a solref of mixed signs", signs
+        remedy = "give two positive numbers, or two that are not"
+        yield "MuJoCo's default in place of a solref of mixed signs", remedy
     if model.opt.enableflags & _ENABLED.mjENBL_SLEEP:
         yield "sleeping bodies", 'remove <flag sleep="enable"/>'
     if model.opt.noslip_iterations:
         yield "noslip_iterations", "remove it"
     if stops_early(model):
-        few = f"where C stops after so few iterations ({model.opt.iterations}), with "
+        early_stop = f"where C stops after so few iterations ({model.opt.iterations}), with "
         if model.opt.solver == _C.mjtSolver.mjSOL_CG:
-            yield few + "conjugate gradients", _GO_ON
+            yield early_stop + "conjugate gradients", _GO_ON
         if model.opt.cone == _C.mjtCone.mjCONE_ELLIPTIC and any(geom_pairs(model)):
-            yield few + "elliptic cones", _GO_ON
+            yield early_stop + "elliptic cones", _GO_ON
     if model.opt.disableactuator:
         yield "disabled groups of actuators", "remove actuatorgroupdisable, or those actuators"
     for flag, values in (("spring", "stiffness"), ("damper", "damping")):
@@ -171,12 +177,13 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
 
 def _missing(model: MjModel) -> Iterator[tuple[str, str]]:
     """Yields what MJX has not, and how to do without it."""
-    values = [(getattr(model, field), *kinds) for field, *kinds in _KINDS]
-    values += [([getattr(model.opt, field)], *kinds) for field, *kinds in _OPTIONS]
+    # The model's values, MJX's enum of those that it has, and C's of all, which has their names.
+    enums = [(getattr(model, field), in_mjx, in_c) for field, in_mjx, in_c in _KINDS]
+    enums += [([getattr(model.opt, field)], in_mjx, in_c) for field, in_mjx, in_c in _OPTIONS]
     flags = [1 << bit for bit in range(_ENABLED.mjNENABLE) if model.opt.enableflags & 1 << bit]
-    for present, known, names in (*values, (flags, mjx.EnableBit, _ENABLED)):
-        for kind in sorted({*map(int, present)} - {*map(int, known)}):
-            name = names(kind).name
+    for values, in_mjx, in_c in (*enums, (flags, mjx.EnableBit, _ENABLED)):
+        for kind in sorted({*map(int, values)} - {*map(int, in_mjx)}):
+            name = in_c(kind).name
             remedy = next((x for part, x in _REMEDIES.items() if part in name), _ELSE)
             # MJX would ignore the discrete integrator, which _ignored says.
             if name != "mjINT_DISCRETE":
@@ -192,9 +199,11 @@ def _missing(model: MjModel) -> Iterator[tuple[str, str]]:
     if _C.mjtSensor.mjSENS_RANGEFINDER in model.sensor_type and not model.nmat:
         remedy = 'add <asset><material name="any"/></asset>'
         yield "its rangefinders work only with a material, a bug of MJX", remedy
+    # [2, n]: what each of the contact sensors looks at, on both sides. The second of its integers
+    # says how contacts are reduced: 3 is reduce="netforce".
     of_contacts = model.sensor_type == _C.mjtSensor.mjSENS_CONTACT
-    ends = np.stack([model.sensor_objtype, model.sensor_reftype])[:, of_contacts]
-    wide = np.isin(ends, (_C.mjtObj.mjOBJ_SITE, _C.mjtObj.mjOBJ_BODY, _C.mjtObj.mjOBJ_XBODY))
+    sides = np.stack([model.sensor_objtype, model.sensor_reftype])[:, of_contacts]
+    wide = np.isin(sides, (_C.mjtObj.mjOBJ_SITE, _C.mjtObj.mjOBJ_BODY, _C.mjtObj.mjOBJ_XBODY))
     if wide.any() or np.any(model.sensor_intprm[of_contacts, 1] == 3):
         remedy = "name two geoms, and do not reduce to the net force"
         yield "MJX has contact sensors between geoms alone, without net force", remedy
@@ -203,33 +212,40 @@ def _missing(model: MjModel) -> Iterator[tuple[str, str]]:
 def _of_contacts(model: MjModel) -> Iterator[tuple[str, str]]:
     """Yields which contacts MJX has not, or finds elsewhere, and how to do without them."""
     groups: dict[tuple[str, str], list[tuple[int, int]]] = {}
-    for first, second, pair in geom_pairs(model):
-        geoms = [int(first), int(second)]
-        kinds = (int(model.geom_type[first]), int(model.geom_type[second]))
-        margin = model.geom_margin[geoms].sum() if pair < 0 else model.pair_margin[pair]
+    for geom1, geom2, pair in geom_pairs(model):
+        geoms = (int(geom1), int(geom2))
+        kinds = (int(model.geom_type[geom1]), int(model.geom_type[geom2]))
+        # The number of a <pair> element, which has a margin of its own, or -1.
+        margin = model.geom_margin[list(geoms)].sum() if pair < 0 else model.pair_margin[pair]
         for reason in _unlike(kinds, margin):
-            groups.setdefault(reason, []).append((geoms[0], geoms[1]))
+            groups.setdefault(reason, []).append(geoms)
+    # A sentence for all pairs of one reason: there may be hundreds of them.
     for (reason, remedy), pairs in groups.items():
-        said = f"{len(pairs):,} pair{'s' * (len(pairs) > 1)} of {reason}"
-        pair_names = [" and ".join(geom_name(model, geom) for geom in pair) for pair in pairs]
-        yield f"{said} ({_listed(pair_names)})", remedy.format(exclude=_exclude(model, pairs))
+        noun = "pairs" if len(pairs) > 1 else "pair"
+        sentence = f"{len(pairs):,} {noun} of {reason} ({_listed(_pair_names(model, pairs))})"
+        yield sentence, remedy.format(exclude=_exclude(model, pairs))
     if model.opt.cone == _C.mjtCone.mjCONE_ELLIPTIC:
-        alone = [pair for condim, *pair in geom_groups(model) if condim == 1]
-        if alone:
-            names = _listed([" and ".join(geom_name(model, geom) for geom in x) for x in alone])
-            said = f"MJX has no contacts of condim 1 in elliptic cones: {len(alone)} ({names})"
-            yield said, 'set <option cone="pyramidal"/> or condim="3"'
+        frictionless = [pair for condim, *pair in geom_groups(model) if condim == 1]
+        if frictionless:
+            names = _listed(_pair_names(model, frictionless))
+            count = len(frictionless)
+            sentence = f"MJX has no contacts of condim 1 in elliptic cones: {count} ({names})"
+            yield sentence, 'set <option cone="pyramidal"/> or condim="3"'
 
 
 def _unlike(kinds: tuple[int, int], margin: float) -> Iterator[tuple[str, str]]:
     """Yields why contacts of geoms of two kinds would be others than C's, and a remedy."""
     names = " on ".join(_GEOM(kind).name[len("mjGEOM_") :].lower() for kind in reversed(kinds))
-    apart = "keep those apart with contype and conaffinity{exclude}, or use "
+    # ``_of_contacts`` fills in an <exclude> of the first pair.
+    advice = (
+        "keep those apart with contype and conaffinity{exclude}, or use "
+        "spheres, capsules, boxes and planes"
+    )
     if _GEOM.mjGEOM_SDF in kinds or not has_collider(*kinds):
-        yield f"{names}, which MJX has not", f"{apart}spheres, capsules, boxes and planes"
+        yield f"{names}, which MJX has not", advice
     elif kinds in UNLIKE_C:
         difference = UNLIKE_C[tuple(map(mjx.GeomType, kinds))]
-        yield f"{names}, {difference}", f"{apart}spheres, capsules, boxes and planes"
+        yield f"{names}, {difference}", advice
     elif margin and kinds in UNLIKE_C_WITHIN_MARGIN:
         remedy = "remove margin and gap from those geoms"
         yield f"{names} with a margin or gap, which MJX ignores", remedy
@@ -243,16 +259,25 @@ def _exclude(model: MjModel, pairs: Sequence[tuple[int, int]]) -> str:
     return ', or with <contact><exclude body1="{}" body2="{}"/></contact>'.format(*names)
 
 
+def _pair_names(model: MjModel, pairs: Sequence[Sequence[int]]) -> list[str]:
+    """Returns what a message calls pairs of geoms."""
+    return [" and ".join(geom_name(model, geom) for geom in pair) for pair in pairs]
+
+
 def geom_name(model: MjModel, geom: int) -> str:
     """Returns what a message calls a geom: by its name, or by its body's and its number."""
     if model.geom(geom).name:
         return model.geom(geom).name
     body = int(model.geom_bodyid[geom])
-    where = model.body(body).name or f"number {body}"
-    return f"geom {geom - int(model.body_geomadr[body])} of body {where}"
+    body_name = model.body(body).name or f"number {body}"
+    # Counted within its body, as it stands in the file.
+    return f"geom {geom - int(model.body_geomadr[body])} of body {body_name}"
 
 
 def _listed(names: Sequence[str]) -> str:
     """Returns the first names, and how many more there are."""
-    more = len(names) - _NAMED
-    return ", ".join(names[:_NAMED]) + (f", and {more:,} more" if more > 0 else "")
+    text = ", ".join(names[:_NAMED])
+    num_unnamed = len(names) - _NAMED
+    if num_unnamed > 0:
+        text += f", and {num_unnamed:,} more"
+    return text

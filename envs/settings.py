@@ -48,19 +48,21 @@ def build_settings(env: Any, arguments: dict[str, Any]) -> Any:
       ValueError: an argument is unknown or missing, or its value is not of its type or range.
     """
     task = type(env).__name__
-    known = {field.name: field for field in dataclasses.fields(env.Settings) if field.init}
+    fields = {field.name: field for field in dataclasses.fields(env.Settings) if field.init}
     for name in arguments:
-        checks.check_name(f"argument of {task}", name, known)
-    none = dataclasses.MISSING
-    needed = [x.name for x in known.values() if x.default is x.default_factory is none]
-    missing = [name for name in needed if name not in arguments]
+        checks.check_name(f"argument of {task}", name, fields)
+    no_default = dataclasses.MISSING
+    # Before the dataclass complains, which would name its constructor and not the task.
+    required = [x.name for x in fields.values() if x.default is x.default_factory is no_default]
+    missing = [name for name in required if name not in arguments]
     if missing:
         raise ValueError(
             f"{task} needs {', '.join(missing)}: pass them, or give them defaults in its Settings"
         )
-    for name, field in known.items():
+    for name, field in fields.items():
         value = arguments.get(name, field.default)
-        if value is not none:
+        # Defaults are checked as well: a task of the user's own may have one of another type.
+        if value is not no_default:
             checks.check_type(f"{name} of {task}", value, field.type)
         if checks.is_nan(value):
             raise ValueError(f"{name} of {task} must be a number, got nan")
@@ -75,6 +77,7 @@ def split_words(words: Sequence[str]) -> dict[str, str]:
     """
     texts: dict[str, str] = {}
     for word in words:
+        # Names as flags have them, too: --env-set frame-skip=2.
         name, equals, text = word.partition("=")
         name = name.replace("-", "_")
         if not (equals and name.isidentifier() and text):
@@ -99,22 +102,25 @@ def read_settings(task: object, words: Sequence[str]) -> dict[str, Any]:
       ValueError: a name is unknown, or a text is not of its type.
     """
     texts = split_words(words)
-    called = getattr(task, "__name__", str(task))
-    form = getattr(task, "Settings", None)
-    if not dataclasses.is_dataclass(form):
+    task_name = getattr(task, "__name__", str(task))
+    schema = getattr(task, "Settings", None)
+    if not dataclasses.is_dataclass(schema):
         raise ValueError(
-            f"--env-set {' '.join(words)} has no effect on {called}: it is not a class with a "
+            f"--env-set {' '.join(words)} has no effect on {task_name}: it is not a class with a "
             "dataclass Settings, as MujocoEnv has"
         )
-    kinds = typing.get_type_hints(form)
-    known = {field.name: kinds[field.name] for field in dataclasses.fields(form) if field.init}
+    # Resolved: under ``from __future__ import annotations`` a field's type is text.
+    kinds = typing.get_type_hints(schema)
+    types = {field.name: kinds[field.name] for field in dataclasses.fields(schema) if field.init}
     for name in texts:
-        checks.check_name(f"setting of {called}", name, known)
-    read = {}
+        checks.check_name(f"setting of {task_name}", name, types)
+    arguments = {}
     for name, text in texts.items():
         try:
-            read[name] = checks.read_as(known[name], text)
+            arguments[name] = checks.read_as(types[name], text)
         except (ValueError, TypeError):
-            said = checks.spoken_kind(known[name])
-            raise ValueError(f"--env-set {name} of {called} must be {said}, got {text!r}") from None
-    return read
+            kind = checks.spoken_kind(types[name])
+            raise ValueError(
+                f"--env-set {name} of {task_name} must be {kind}, got {text!r}"
+            ) from None
+    return arguments

@@ -57,11 +57,14 @@ class Ant(Healthy):
           ValueError: the model has no ``main_body``, or as ``MujocoEnv``.
         """
         super().__init__(**arguments)
-        main_body, xml_file = self.settings.main_body, self.settings.xml_file
+        main_body = self.settings.main_body
+        # MuJoCo's own error names neither the setting nor the file.
         try:
             self._main_body = self.mj_model.body(main_body).id
         except (KeyError, IndexError) as error:
-            raise ValueError(f"main_body {main_body!r} is not in {xml_file}: {error}") from None
+            raise ValueError(
+                f"main_body {main_body!r} is not in {self.settings.xml_file}: {error}"
+            ) from None
 
     def place(self, data):
         """Returns x and y of the main body [2] (m) at the last forward pass."""
@@ -69,6 +72,7 @@ class Ant(Healthy):
 
     def is_healthy(self, data):
         """Returns whether the height is in its range and the whole state finite."""
+        # Bounds included, unlike those of the other walkers.
         low, high = self.settings.healthy_z_range
         finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
         return finite & (low <= data.qpos[2]) & (data.qpos[2] <= high)
@@ -83,6 +87,7 @@ class Ant(Healthy):
         motion = super().observe(data)
         if not self.settings.include_cfrc_ext_in_observation:
             return motion
+        # Without those on the world, body 0.
         return jnp.concatenate([motion, self._forces(data)[1:].ravel()])
 
     def _forces(self, data):

@@ -12,7 +12,9 @@ _POSITION_NOISE = 0.1
 _VELOCITY_NOISE = 0.005
 # The cylinder starts in [-_DEPTH, 0] x [-_HALF_WIDTH, _HALF_WIDTH], farther than _CLEAR from the
 # goal at the origin.
-_DEPTH, _HALF_WIDTH, _CLEAR = 0.3, 0.2, 0.17
+_DEPTH = 0.3
+_HALF_WIDTH = 0.2
+_CLEAR = 0.17
 
 
 class Reacher(MujocoEnv):
@@ -48,15 +50,19 @@ class Reacher(MujocoEnv):
         """Draws qpos [4] and qvel [4]; the target in polar coordinates, without rejection."""
         angle_key, target_key, qvel_key = jax.random.split(rng, 3)
         noise = jax.random.uniform(angle_key, (2,), minval=-_POSITION_NOISE, maxval=_POSITION_NOISE)
-        area, turn = jax.random.uniform(target_key, (2,))
-        radius, turn = _GOAL_RADIUS * jnp.sqrt(area), 2 * jnp.pi * turn
+        # The area within a radius grows as its square, so the root of a uniform number is uniform
+        # on the disc. Gymnasium draws points of the square until one is in it.
+        area_share, turns = jax.random.uniform(target_key, (2,))
+        radius = _GOAL_RADIUS * jnp.sqrt(area_share)
+        angle = 2 * jnp.pi * turns
         qvel = jax.random.uniform(qvel_key, (2,), minval=-_VELOCITY_NOISE, maxval=_VELOCITY_NOISE)
         angles = jnp.asarray(self.mj_model.qpos0[:2], noise.dtype) + noise
-        target = radius * jnp.stack([jnp.cos(turn), jnp.sin(turn)])
+        target = radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
         return jnp.concatenate([angles, target]), jnp.concatenate([qvel, jnp.zeros(2)])
 
     def observe(self, data):
         """Returns the observation [10]."""
+        # qpos[2:] is the target's position: it moves on two joints, which no motor drives.
         angles = data.qpos[:2]
         away = self._away(data)[:2]
         return jnp.concatenate(
@@ -117,6 +123,7 @@ class Pusher(MujocoEnv):
         cylinder_key, qvel_key = jax.random.split(rng)
         cylinder = _cylinder(cylinder_key)
         qvel = jax.random.uniform(qvel_key, (7,), minval=-_VELOCITY_NOISE, maxval=_VELOCITY_NOISE)
+        # Of 11 joints seven are the arm's; then come the cylinder's two and the goal's two.
         arm = jnp.asarray(self.mj_model.qpos0[:7], qvel.dtype)
         return (
             jnp.concatenate([arm, cylinder, jnp.zeros(2)]),
@@ -133,6 +140,7 @@ class Pusher(MujocoEnv):
 
     def outcome(self, before, data, action):
         """Returns the penalties for distances and control; never terminates."""
+        # All at the last forward pass, as in Gymnasium, not at the new qpos.
         cylinder = data.body("object").xpos
         near = cylinder - data.body("tips_arm").xpos
         dist = cylinder - data.body("goal").xpos
@@ -156,17 +164,21 @@ def _cylinder(key):
     depth_share, side = jax.random.uniform(key, (2,))
     side = 2 * side - 1
 
-    def edge(depth):  # of the disc, across
+    def edge(depth):
+        """Returns half the width of the disc at a depth."""
         return jnp.sqrt(jnp.maximum(_CLEAR**2 - depth**2, 0))
 
     def area(depth):
-        inside = jnp.minimum(depth, _CLEAR)
-        disc = _CLEAR**2 * jnp.arcsin(inside / _CLEAR) + inside * edge(inside)
+        # Half of it, to one side: the rectangle nearer than ``depth`` less its part of the disc.
+        disc_depth = jnp.minimum(depth, _CLEAR)
+        disc = _CLEAR**2 * jnp.arcsin(disc_depth / _CLEAR) + disc_depth * edge(disc_depth)
         return _HALF_WIDTH * depth - disc / 2
 
-    wanted = depth_share * area(jnp.full_like(side, _DEPTH))
+    # The derivative of the area is how wide the free strip is at that depth.
+    target_area = depth_share * area(jnp.full_like(side, _DEPTH))
     depth = jnp.full_like(side, _DEPTH)
     for _ in range(12):
-        depth = depth - (area(depth) - wanted) / (_HALF_WIDTH - edge(depth))
+        depth = depth - (area(depth) - target_area) / (_HALF_WIDTH - edge(depth))
+    # Across, beyond the disc on either side.
     across = edge(depth) + jnp.abs(side) * (_HALF_WIDTH - edge(depth))
     return jnp.stack([-depth, jnp.copysign(across, side)])

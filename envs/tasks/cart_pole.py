@@ -17,9 +17,15 @@ from mjx_reinforce.engine.checks import changed_fields
 from mjx_reinforce.envs.base import Env, State
 from mjx_reinforce.envs.settings import EpisodeSettings, build_settings
 
-_GRAVITY, _CART_MASS, _POLE_MASS, _HALF_LENGTH = 9.8, 1.0, 0.1, 0.5
-_TIMESTEP, _FORCE = 0.02, 10.0
-_MAX_POSITION, _START_NOISE = 2.4, 0.05
+# The constants of Gymnasium's cart-pole, in SI units.
+_GRAVITY = 9.8
+_CART_MASS = 1.0
+_POLE_MASS = 0.1
+_HALF_LENGTH = 0.5
+_TIMESTEP = 0.02
+_FORCE = 10.0
+_MAX_POSITION = 2.4
+_START_NOISE = 0.05
 
 
 @struct.dataclass(kw_only=True)
@@ -39,7 +45,8 @@ class Cart(Env):
 
     settings: EpisodeSettings
 
-    dt, frame_skip = _TIMESTEP, 1
+    dt = _TIMESTEP
+    frame_skip = 1
     #: The model that shows ``qpos`` in pictures and videos; the dynamics do not use it.
     scene = "cart_pole.xml"
     action_space: Box | Discrete
@@ -102,6 +109,7 @@ class Cart(Env):
         motion = cast(Motion, state.pipeline_state)
         qacc = _acceleration(motion, force)
         qvel = motion.qvel + _TIMESTEP * qacc
+        # Explicit Euler, as in Gymnasium: positions move by the old velocities.
         qpos = motion.qpos + _TIMESTEP * motion.qvel
         lost = jnp.any(jnp.abs(qpos) > jnp.array([_MAX_POSITION, self.max_angle], qpos.dtype))
         reward = jnp.where(lost, reward_lost, reward_up).astype(qpos.dtype)
@@ -136,8 +144,11 @@ class CartPole(Cart):
 
     def step(self, state: State, action: jax.Array) -> State:
         """Returns the state one step later under ``action`` []."""
-        up, lost = (0.0, -1.0) if self.settings.sutton_barto_reward else (1.0, 1.0)
-        return self.push(state, jnp.where(action == 1, _FORCE, -_FORCE), up, lost)
+        sutton_barto = self.settings.sutton_barto_reward
+        reward_up = 0.0 if sutton_barto else 1.0
+        reward_lost = -1.0 if sutton_barto else 1.0
+        force = jnp.where(action == 1, _FORCE, -_FORCE)
+        return self.push(state, force, reward_up, reward_lost)
 
 
 class ContinuousCartPole(Cart):
@@ -173,20 +184,29 @@ def _acceleration(motion: Motion, force: jax.Array | float) -> jax.Array:
     Florian (2007), Correct equations for the dynamics of the cart-pole system, equations 23 and
     24 without friction.
     """
-    angle, rate = motion.qpos[1], motion.qvel[1]
-    sine, cosine = jnp.sin(angle), jnp.cos(angle)
-    mass, moment = _CART_MASS + _POLE_MASS, _POLE_MASS * _HALF_LENGTH
+    angle = motion.qpos[1]
+    rate = motion.qvel[1]
+    sine = jnp.sin(angle)
+    cosine = jnp.cos(angle)
+    mass = _CART_MASS + _POLE_MASS
+    moment = _POLE_MASS * _HALF_LENGTH
+    # The cart's acceleration if the pole did not turn faster or slower.
     push = (force + moment * rate**2 * sine) / mass
-    turn = (_GRAVITY * sine - cosine * push) / (
+    # 4/3 is the pole's inertia about its end, over its mass and its half length squared.
+    angular_acceleration = (_GRAVITY * sine - cosine * push) / (
         _HALF_LENGTH * (4.0 / 3.0 - _POLE_MASS * cosine**2 / mass)
     )
-    return jnp.stack([push - moment * turn * cosine / mass, turn])
+    acceleration = push - moment * angular_acceleration * cosine / mass
+    return jnp.stack([acceleration, angular_acceleration])
 
 
-def _state(qpos, qvel, reward, done, previous: State | None = None) -> State:
+def _state(qpos, qvel, reward, terminated, previous: State | None = None) -> State:
     """Returns a state; all else is as in the previous one, such as what wrappers keep there."""
+    # Gymnasium's order is position and velocity of the cart, then of the pole.
     motion = cast(Any, Motion(qpos=qpos, qvel=qvel))
     obs = jnp.stack([qpos[0], qvel[0], qpos[1], qvel[1]])
     if previous is None:
-        return State(motion, obs, reward, done)
-    return dataclasses.replace(previous, pipeline_state=motion, obs=obs, reward=reward, done=done)
+        return State(motion, obs, reward, terminated)
+    return dataclasses.replace(
+        previous, pipeline_state=motion, obs=obs, reward=reward, done=terminated
+    )

@@ -44,13 +44,14 @@ class Person(Body):
 
     def observe(self, data):
         """Returns positions, velocities and, unless left out, inertias, motions and forces."""
-        chosen = self.settings
+        settings = self.settings
+        # Without the world, body 0, and without the root, whose six freedoms no motor drives.
         parts = [
             (True, super().observe(data)),
-            (chosen.include_cinert_in_observation, data.cinert[1:]),
-            (chosen.include_cvel_in_observation, data.cvel[1:]),
-            (chosen.include_qfrc_actuator_in_observation, data.qfrc_actuator[6:]),
-            (chosen.include_cfrc_ext_in_observation, data.cfrc_ext[1:]),
+            (settings.include_cinert_in_observation, data.cinert[1:]),
+            (settings.include_cvel_in_observation, data.cvel[1:]),
+            (settings.include_qfrc_actuator_in_observation, data.qfrc_actuator[6:]),
+            (settings.include_cfrc_ext_in_observation, data.cfrc_ext[1:]),
         ]
         return jnp.concatenate([part.ravel() for included, part in parts if included])
 
@@ -95,6 +96,7 @@ class Humanoid(Person, Healthy):
 
     def place(self, data):
         """Returns x and y of the mass center [2] (m) at the last forward pass."""
+        # [nbody]; the world, body 0, has no mass, and so no weight in the mean.
         mass = self.mj_model.body_mass
         return jnp.asarray(mass / mass.sum(), data.xipos.dtype) @ data.xipos[:, :2]
 
@@ -104,8 +106,10 @@ class Humanoid(Person, Healthy):
 
     def terms(self, data):
         """Returns the reward for health and the cost of contacts."""
-        weight, bounds = self.settings.contact_cost_weight, self.settings.contact_cost_range
-        return super().terms(data) | {"reward_contact": -self.contact_cost(data, weight, bounds)}
+        settings = self.settings
+        terms = super().terms(data)
+        cost = self.contact_cost(data, settings.contact_cost_weight, settings.contact_cost_range)
+        return terms | {"reward_contact": -cost}
 
 
 class HumanoidStandup(Person):
@@ -138,7 +142,9 @@ class HumanoidStandup(Person):
 
     def outcome(self, before, data, action):
         """Returns the reward for height less the costs, and its terms; never terminates."""
-        height, weights = data.qpos[2], self.settings
+        height = data.qpos[2]
+        weights = self.settings
+        # Gymnasium divides by the physics timestep, so a height of 1 m earns 333 a step.
         terms = {
             "reward_linup": weights.uph_cost_weight * height / self.mj_model.opt.timestep,
             "reward_quadctrl": -self.control_cost(action),
@@ -146,9 +152,9 @@ class HumanoidStandup(Person):
                 data, weights.impact_cost_weight, weights.impact_cost_range
             ),
         }
-        where = {
+        info = {
             "x_position": data.qpos[0],
             "y_position": data.qpos[1],
             "z_distance_from_origin": height - self.mj_model.qpos0[2],
         }
-        return sum(terms.values()) + 1, jnp.zeros((), bool), terms | where
+        return sum(terms.values()) + 1, jnp.zeros((), bool), terms | info

@@ -38,6 +38,7 @@ class InvertedPendulum(NearPose):
 
     def outcome(self, before, data, action):
         """Returns 1 while the pole is up, and whether it fell."""
+        # Comparisons with NaN are false: without this a state of NaN would be upright for good.
         finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
         terminated = ~finite | (jnp.abs(data.qpos[1]) > _MAX_ANGLE)
         reward = jnp.where(terminated, self.settings.reward_at_fall, 1.0)
@@ -78,6 +79,7 @@ class InvertedDoublePendulum(NearPose):
         """Returns the observation [9]."""
         angles = data.qpos[1:]
         rates = jnp.clip(data.qvel, -10, 10)
+        # The cart's alone: nothing holds the hinges. Gymnasium had all three before v5.
         force = jnp.clip(data.qfrc_constraint[:1], -10, 10)
         return jnp.concatenate([data.qpos[:1], jnp.sin(angles), jnp.cos(angles), rates, force])
 
@@ -87,6 +89,7 @@ class InvertedDoublePendulum(NearPose):
         The tip's position is that of the last Runge-Kutta stage, as in Gymnasium, not that of the
         new qpos.
         """
+        # Gymnasium calls the tip's height y; the third axis is z in MuJoCo.
         x, _, y = data.site_xpos[0]
         terminated = y <= 1
         terms = {

@@ -78,13 +78,16 @@ class PlanarWalker(Healthy):
 
     def is_healthy(self, data):
         """Returns whether height and angle are within their ranges."""
-        z, angle = data.qpos[1], data.qpos[2]
+        # qpos is x, z and the pitch of the torso, then the joints.
+        z = data.qpos[1]
+        angle = data.qpos[2]
         ranges = self.settings
         return within(z, ranges.healthy_z_range) & within(angle, ranges.healthy_angle_range)
 
     def outcome(self, before, data, action):
         """Adds how far above its starting pose the torso is (m)."""
         reward, terminated, terms = super().outcome(before, data, action)
+        # Gymnasium's ``info``, which earns nothing.
         height = data.qpos[1] - self.mj_model.qpos0[1]
         return reward, terminated, terms | {"z_distance_from_origin": height}
 
@@ -122,6 +125,7 @@ class Hopper(PlanarWalker):
 
     def is_healthy(self, data):
         """Returns whether the height, the angle and all else but x are within their ranges."""
+        # Without x and z, which have no such bound, or one of their own.
         state = jnp.concatenate([data.qpos[2:], data.qvel])
         return super().is_healthy(data) & jnp.all(within(state, self.settings.healthy_state_range))
 

@@ -1,1 +1,1 @@
-"""Policies: networks to action distributions, and the statistics that scale observations."""
+"""REINFORCE: policies, gradient estimators, updates of the parameters, and the learner."""

@@ -21,7 +21,6 @@ Shepherd and Laframboise (1981), "Chebyshev approximation of (1 + 2x) exp(x^2) e
 
 import functools
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,9 +40,10 @@ from mjx_reinforce.learning.distributions import (
     normal_log_density,
 )
 
-# float32 cannot recover a z much beyond the first number from tanh(z). Samples beyond it are all
-# recorded as the second.
-_SATURATED, _SATURATION = 5.0, 6.0
+# float32 cannot recover a z much beyond this from tanh(z).
+_MAX_Z = 5.0
+# Samples beyond ``_MAX_Z`` are all recorded as this.
+_SATURATED_Z = 6.0
 # The least standard deviation of z: float32 recovers z from tanh(z) to 1e-3 or better.
 _LEAST_TANH_STD = 0.005
 _PIVOT = 4.0
@@ -81,38 +81,40 @@ def tanh_normal(
     """
     layout = _bounded_outputs("tanh-normal", space, std, initial_std, rescale)
     middle, half = middle_and_half_range(layout.box)
-    least, initial = _LEAST_TANH_STD * half, layout.initial_std
-    if isinstance(initial, np.ndarray) and np.any(initial < least):
-        shown = [float(f"{x:.6g}") for x in least]
+    min_std = _LEAST_TANH_STD * half
+    initial_std = layout.initial_std
+    if isinstance(initial_std, np.ndarray) and np.any(initial_std < min_std):
+        rounded = [float(f"{x:.6g}") for x in min_std]
         raise ValueError(
             f"tanh-normal needs an initial_std of {_LEAST_TANH_STD} of half the action's range or "
-            f"more, here {shown}, got {initial.tolist()}; or choose truncated-normal"
+            f"more, here {rounded}, got {initial_std.tolist()}; or choose truncated-normal"
         )
 
-    def of_z(mean, std):
+    # The network's Normal is in the action's unit, as that of ``normal``; z is in half ranges.
+    def to_z(mean, std):
         return (mean - middle) / half, jnp.maximum(std / half, _LEAST_TANH_STD)
 
-    def of_both(function):
-        """Returns a function of two Normals that is given those of z."""
-        return lambda *given: function(*of_z(*given[:2]), *of_z(*given[2:]))
-
     def sample(noise, mean, std):
-        mean, std = of_z(mean, std)
+        mean, std = to_z(mean, std)
         z = mean + std * noise
-        return middle + half * jnp.tanh(
-            jnp.where(jnp.abs(z) < _SATURATED, z, jnp.sign(z) * _SATURATION)
-        )
+        # A saturated sample stands for the whole tail, whose probability ``log_prob`` then gives.
+        z = jnp.where(jnp.abs(z) < _MAX_Z, z, jnp.sign(z) * _SATURATED_Z)
+        return middle + half * jnp.tanh(z)
+
+    def kl(mean, std, other_mean, other_std):
+        # A one-to-one map of both variables leaves a divergence as it is.
+        return normal_kl(*to_z(mean, std), *to_z(other_mean, other_std))
 
     family = layout.family(
         sample=sample,
         mode=lambda mean: middle + half * jnp.tanh((mean - middle) / half),
         log_density=lambda action, mean, std: _tanh_log_density(
-            (action - middle) / half, *of_z(mean, std), half
+            (action - middle) / half, *to_z(mean, std), half
         ),
-        entropy=lambda mean, std: _tanh_entropy(*of_z(mean, std), half),
-        kl=of_both(normal_kl),
+        entropy=lambda mean, std: _tanh_entropy(*to_z(mean, std), half),
+        kl=kl,
     )
-    return family._replace(std=lambda outputs: half * of_z(*layout.split(outputs))[1])
+    return family._replace(std=lambda outputs: half * to_z(*layout.split(outputs))[1])
 
 
 def _tanh_log_density(
@@ -126,11 +128,15 @@ def _tanh_log_density(
       std: [..., A] of z.
       half: [A] half the width of the action's range.
     """
-    saturated = jnp.abs(squashed) > 0.5 * (np.tanh(_SATURATED) + np.tanh(_SATURATION))
+    # No sample lies between the two values of tanh, so rounding cannot confuse the cases.
+    saturated = jnp.abs(squashed) > 0.5 * (np.tanh(_MAX_Z) + np.tanh(_SATURATED_Z))
+    # 0 in place of a saturated value, whose infinite slope would make the gradient NaN, though
+    # ``where`` takes the other case.
     z = jnp.arctanh(jnp.where(saturated, 0.0, squashed))
-    inside = normal_log_density(z, mean, std) - _log_tanh_slope(z) - np.log(half)
-    beyond = log_tail((_SATURATED - jnp.sign(squashed) * mean) / std)
-    return jnp.where(saturated, beyond, inside)
+    # The change of variables: the density of z over the slope of half tanh(z).
+    log_density = normal_log_density(z, mean, std) - _log_tanh_slope(z) - np.log(half)
+    log_tail_mass = log_tail((_MAX_Z - jnp.sign(squashed) * mean) / std)
+    return jnp.where(saturated, log_tail_mass, log_density)
 
 
 def _tanh_entropy(mean: jax.Array, std: jax.Array, half: np.ndarray) -> jax.Array:
@@ -140,6 +146,7 @@ def _tanh_entropy(mean: jax.Array, std: jax.Array, half: np.ndarray) -> jax.Arra
     Gauss-Hermite quadrature.
     """
     nodes, weights = np.polynomial.hermite_e.hermegauss(32)
+    # Its weights belong to exp(-x^2 / 2); over their sum, sqrt(2 pi), they are probabilities.
     rule = zip(nodes.tolist(), (weights / np.sum(weights)).tolist(), strict=True)
     slopes = [weight * _log_tanh_slope(mean + std * node) for node, weight in rule]
     return normal_entropy(std) + sum(slopes) + np.log(half)
@@ -171,8 +178,8 @@ def truncated_normal(
     layout = _bounded_outputs("truncated-normal", space, std, initial_std, rescale)
 
     def restricted(function):
-        """Returns a function that is given the bounds after its other arguments."""
-        return lambda *given: function(*given, *_bounds(layout, given[-1]))
+        """Returns a function that hands the bounds on, after its own arguments."""
+        return lambda *arguments: function(*arguments, *_bounds(layout, arguments[-1]))
 
     return layout.family(
         sample=restricted(truncated_sample),
@@ -194,9 +201,11 @@ def _open_uniform(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     return noise + 0.5 * jnp.finfo(noise.dtype).eps
 
 
-def _bounded_outputs(name: str, space: Box | Discrete, *settings: Any) -> GaussianOutputs:
+def _bounded_outputs(
+    name: str, space: Box | Discrete, std: str, initial_std: ArrayLike | None, rescale: bool
+) -> GaussianOutputs:
     """Returns ``gaussian_outputs``; raises ValueError besides where an entry is unbounded."""
-    layout = gaussian_outputs(name, space, *settings)
+    layout = gaussian_outputs(name, space, std, initial_std, rescale)
     if not np.all(np.isfinite(layout.box.low) & np.isfinite(layout.box.high)):
         raise ValueError(
             f"{name} needs finite action bounds, got {space}; "
@@ -219,18 +228,24 @@ def half_line(order: int, c: jax.Array) -> jax.Array:
       c: [...] distance of the anchor from the mean, in standard deviations.
     """
     coefficients = _series(order, float(jnp.finfo(c.dtype).eps))
+    # From [0, inf) to (-1, 1], where Chebyshev polynomials live.
     argument = (_PIVOT - c) / (_PIVOT + c)
-    last = last_but_one = jnp.zeros_like(c)
+    # Clenshaw's recurrence, from the highest coefficient down to the second.
+    term = previous_term = jnp.zeros_like(c)
     for coefficient in coefficients[:0:-1]:
-        last, last_but_one = 2.0 * argument * last - last_but_one + coefficient, last
-    total = argument * last - last_but_one + coefficients[0]
+        next_term = 2.0 * argument * term - previous_term + coefficient
+        previous_term = term
+        term = next_term
+    total = argument * term - previous_term + coefficients[0]
+    # The series is that of (1 + c)^(n + 1) F_n(c), which stays finite for all c.
     scale = 1.0 / (1.0 + c)
     return total * scale ** (order + 1)
 
 
 @half_line.defjvp
 def _half_line_jvp(order, primals, tangents):
-    (c,), (slope,) = primals, tangents
+    (c,) = primals
+    (slope,) = tangents
     return half_line(order, c), -half_line(order + 1, c) * slope
 
 
@@ -247,26 +262,33 @@ def segment(order: int, c: jax.Array, width: jax.Array) -> jax.Array:
       c: [...] at least 0, except that it may be anything where ``width`` is 0.
       width: [...] at least 0.
     """
-    c, width = jnp.maximum(c, 0.0), jnp.minimum(width, _FAR)
+    c = jnp.maximum(c, 0.0)
+    width = jnp.minimum(width, _FAR)
+    # Minus the logarithm of the factor by which the density falls over the segment.
     drop = width * (0.5 * width + c)
     short = drop < 1.0
-    rest = sum(
+    # What lies beyond the segment: the half-line from t = width, with t = width + u and the
+    # binomial theorem for t^n.
+    beyond = sum(
         math.comb(order, k) * width ** (order - k) * half_line(k, c + width)
         for k in range(order + 1)
     )
-    long = half_line(order, c) - jnp.exp(-drop) * rest
+    difference = half_line(order, c) - jnp.exp(-drop) * beyond
+    # 0 where the result is not used, so that nothing there overflows.
     width = jnp.where(short, width, 0.0)
     nodes, weights = _legendre(6 if c.dtype == jnp.float32 else 12)
-    terms = sum(
+    quadrature = sum(
         weight * node**order * jnp.exp(-node * width * (0.5 * node * width + c))
         for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True)
     )
-    return jnp.where(short, terms * width ** (order + 1), long)
+    return jnp.where(short, quadrature * width ** (order + 1), difference)
 
 
 @segment.defjvp
 def _segment_jvp(order, primals, tangents):
-    (c, width), (c_slope, width_slope) = primals, tangents
+    c, width = primals
+    c_slope, width_slope = tangents
+    # In ``width`` the derivative is the integrand there, in c minus the next integral.
     edge = jnp.minimum(width, _FAR) ** order * jnp.exp(-width * (0.5 * width + c))
     slope = edge * width_slope - segment(order + 1, c, width) * c_slope
     return segment(order, c, width), slope
@@ -276,6 +298,7 @@ def log_tail(x: jax.Array) -> jax.Array:
     """Returns the log-probability [...] that a standard Normal exceeds ``x`` [...]."""
     upper = x >= 0
     distance = jnp.where(upper, x, -x)
+    # Of the smaller tail, which is exact; the larger is one minus it.
     log_small = -0.5 * distance**2 + jnp.log(half_line(0, distance)) - LOG_SQRT_2PI
     return jnp.where(upper, log_small, jnp.log1p(-jnp.exp(log_small)))
 
@@ -297,9 +320,10 @@ def truncated_log_density(
     action: jax.Array, mean: jax.Array, std: jax.Array, low: jax.Array, high: jax.Array
 ) -> jax.Array:
     """Returns the log-density [...] of a Normal restricted to [low, high]; -inf outside."""
-    mode, c, left, right = anchor(mean, std, low, high)
+    mode, c, to_low, to_high = anchor(mean, std, low, high)
     t = (action - mode) / std
-    mass = segment(0, -c, left) + segment(0, c, right)
+    # One of the two segments has no width, unless c is 0.
+    mass = segment(0, -c, to_low) + segment(0, c, to_high)
     value = -t * (0.5 * t + c) - jnp.log(std) - jnp.log(mass)
     return jnp.where((action >= low) & (action <= high), value, -jnp.inf)
 
@@ -313,10 +337,14 @@ def truncated_entropy(
     bounds. By partial integration the expectation is (1 + c E[t] - boundary terms) / 2, and these
     terms stay of order one far out.
     """
-    _, c, left, right = anchor(mean, std, low, high)
-    mass = segment(0, -c, left) + segment(0, c, right)
-    offset = (segment(1, c, right) - segment(1, -c, left)) / mass
-    edges = left * jnp.exp(-left * (0.5 * left - c)) + right * jnp.exp(-right * (0.5 * right + c))
+    _, c, to_low, to_high = anchor(mean, std, low, high)
+    mass = segment(0, -c, to_low) + segment(0, c, to_high)
+    # E[t]: to the left of the anchor t is negative, and c has the other sign.
+    offset = (segment(1, c, to_high) - segment(1, -c, to_low)) / mass
+    # The boundary terms: the distance of each bound times the relative density there.
+    low_edge = to_low * jnp.exp(-to_low * (0.5 * to_low - c))
+    high_edge = to_high * jnp.exp(-to_high * (0.5 * to_high + c))
+    edges = low_edge + high_edge
     return jnp.log(std) + jnp.log(mass) + 0.5 * (1.0 + c * offset - edges / mass)
 
 
@@ -334,18 +362,24 @@ def truncated_kl(
     mean under the first of (r t + a)^2 / 2 + c' (r t + a) - t^2 / 2 - c t. The terms are small
     where the two are nearly equal.
     """
-    mode, c, left, right = anchor(mean, std, low, high)
-    other_mode, other_c, other_left, other_right = anchor(other_mean, other_std, low, high)
-    mass = segment(0, -c, left) + segment(0, c, right)
-    other_mass = segment(0, -other_c, other_left) + segment(0, other_c, other_right)
-    offset = (segment(1, c, right) - segment(1, -c, left)) / mass
-    square = (segment(2, c, right) + segment(2, -c, left)) / mass
-    ratio, apart = std / other_std, (mode - other_mode) / other_std
+    mode, c, to_low, to_high = anchor(mean, std, low, high)
+    other_mode, other_c, other_to_low, other_to_high = anchor(other_mean, other_std, low, high)
+    # W and W' of the docstring, then E[t] and E[t^2] under the first.
+    mass = segment(0, -c, to_low) + segment(0, c, to_high)
+    other_mass = segment(0, -other_c, other_to_low) + segment(0, other_c, other_to_high)
+    offset = (segment(1, c, to_high) - segment(1, -c, to_low)) / mass
+    square = (segment(2, c, to_high) + segment(2, -c, to_low)) / mass
+    # r and a of the docstring.
+    ratio = std / other_std
+    shift = (mode - other_mode) / other_std
     log_ratio = jnp.log(other_mass / mass) - jnp.log(ratio)
-    linear = ratio * (other_c + apart) - c
+    # What multiplies t and t^2 in the mean: small where the two Normals are nearly equal.
+    linear = ratio * (other_c + shift) - c
     quadratic = 0.5 * (ratio - 1.0) * (ratio + 1.0)
-    kl = log_ratio + quadratic * square + linear * offset + apart * (0.5 * apart + other_c)
-    return kl + jax.lax.stop_gradient(jnp.maximum(-kl, 0.0))  # of equal ones the derivatives count
+    kl = log_ratio + quadratic * square + linear * offset + shift * (0.5 * shift + other_c)
+    # Rounding may leave less than 0. It is lifted without a gradient: the derivatives of the
+    # divergence of nearly equal Normals count in the natural gradient.
+    return kl + jax.lax.stop_gradient(jnp.maximum(-kl, 0.0))
 
 
 def truncated_sample(
@@ -356,9 +390,10 @@ def truncated_sample(
     The function that is inverted is the integral from the anchor to the sample, to the left or to
     the right, so a sample in a far tail is as exact as one near the mean.
     """
-    mode, c, left, right = anchor(mean, std, low, high)
-    left_mass = segment(0, -c, left)
-    mass = uniform * (left_mass + segment(0, c, right)) - left_mass
+    mode, c, to_low, to_high = anchor(mean, std, low, high)
+    low_mass = segment(0, -c, to_low)
+    # What lies between the anchor and the sample; negative where the sample is below.
+    mass = uniform * (low_mass + segment(0, c, to_high)) - low_mass
     distance = _invert(jnp.abs(c), jnp.abs(mass))
     return jnp.clip(mode + std * jnp.where(mass < 0, -distance, distance), low, high)
 
@@ -372,10 +407,12 @@ def _invert(c: jax.Array, mass: jax.Array) -> jax.Array:
     """
     eps = float(jnp.finfo(c.dtype).eps)
     hazard = 1.0 / half_line(0, c)
+    # Minus the log of the share of the half-line that lies beyond t; never infinite.
     log_drop = -jnp.log1p(-jnp.minimum(mass * hazard, 1.0 - 0.5 * eps))
     curvature = jnp.clip(hazard * (hazard - c), 2.0 / math.pi, 1.0)
     guess = 2.0 * log_drop / (hazard + jnp.sqrt(hazard**2 + 2.0 * curvature * log_drop))
     t = guess
+    # Halley's method triples the number of correct digits in each step.
     for _ in range(2 if c.dtype == jnp.float32 else 3):
         mills = half_line(0, c + t)
         excess = (t * (0.5 * t + c) - jnp.log(mills * hazard) - log_drop) * mills
@@ -395,12 +432,15 @@ def _series(order: int, eps: float) -> tuple[float, ...]:
     nothing cancels.
     """
     nodes, weights = _legendre(12)
+    # s from 0 to 50, in panels of 1/2: beyond, the integrand is far below the rounding of float64.
     panels = np.arange(100)[:, None]
-    s, ds = 0.5 * (panels + nodes).ravel(), 0.5 * np.tile(weights, 100)
+    s = 0.5 * (panels + nodes).ravel()
+    ds = 0.5 * np.tile(weights, 100)
 
     # Chebyshev points in (-1, 1), and the discrete cosine transform of the values there.
     count = 71
-    odd, index = 2 * np.arange(count) + 1, np.arange(count)[:, None]
+    odd = 2 * np.arange(count) + 1
+    index = np.arange(count)[:, None]
     c = _PIVOT * np.tan(0.25 * np.pi * odd / count) ** 2
     z = 1.0 / (1.0 + c[:, None])
     values = np.sum(ds * s**order * np.exp(-0.5 * (s * z) ** 2 - s * (1.0 - z)), axis=1)

@@ -21,7 +21,8 @@ _NUM_STEPS = 5
 
 def check_horizon(env: Environment, horizon: int | None) -> int:
     """Returns the time limit in steps, or raises ValueError."""
-    horizon = getattr(env, "max_episode_steps", None) if horizon is None else horizon
+    if horizon is None:
+        horizon = getattr(env, "max_episode_steps", None)
     if horizon is None:
         raise ValueError("the env declares no max_episode_steps: give a horizon (--horizon N)")
     check_type("horizon", horizon, int)
@@ -47,27 +48,33 @@ def check_policy(
         "policy.distribution", distribution, Distribution, "mjx_reinforce.normal(env.action_space)"
     )
     params = traced("policy.init(key)", policy.init, jax.random.key(0))
+    # Of two observations: a policy that takes a single one alone would fail in the rollout.
     observation = jax.ShapeDtypeStruct((2, observation_size), jnp.result_type(float))
-    given = f"policy.apply(params, observation [2, {observation_size}])"
-    outputs = traced(given, policy.apply, params, observation)
-    count, constants = distribution.num_outputs, len(distribution.constants)
-    if getattr(outputs, "shape", None) != (2, count + constants):
-        fixed = f", then distribution.constants [2, {constants}], as parameters" * bool(constants)
+    call = f"policy.apply(params, observation [2, {observation_size}])"
+    outputs = traced(call, policy.apply, params, observation)
+    num_outputs = distribution.num_outputs
+    num_constants = len(distribution.constants)
+    if getattr(outputs, "shape", None) != (2, num_outputs + num_constants):
+        constants = ""
+        if num_constants:
+            constants = f", then distribution.constants [2, {num_constants}], as parameters"
         raise ValueError(
-            f"{given} must return [2, {count + constants}]: what a network computes [2, {count}]"
-            f"{fixed}; got {described(outputs)}"
+            f"{call} must return [2, {num_outputs + num_constants}]: what a network computes "
+            f"[2, {num_outputs}]{constants}; got {described(outputs)}"
         )
     if not jnp.issubdtype(outputs.dtype, jnp.floating):
-        raise ValueError(f"{given} must return floating-point numbers, got {outputs.dtype}")
+        raise ValueError(f"{call} must return floating-point numbers, got {outputs.dtype}")
 
     def draw(outputs):
         return distribution.sample(outputs, distribution.noise(jax.random.key(0), (2,)))
 
-    action, size = traced("policy.distribution.sample", draw, outputs), null_action(env).shape
-    if getattr(action, "shape", None) != (2, *size):
+    action = traced("policy.distribution.sample", draw, outputs)
+    action_shape = null_action(env).shape
+    if getattr(action, "shape", None) != (2, *action_shape):
         raise ValueError(
             f"policy.distribution draws actions {described(action)} for two observations, "
-            f"{type(env).__name__} takes {[2, *size]}; make it for the actions of this environment"
+            f"{type(env).__name__} takes {[2, *action_shape]}; make it for the actions of this "
+            "environment"
         )
     if likelihood:
         traced("policy.distribution.log_prob", distribution.log_prob, outputs, action)
@@ -75,11 +82,12 @@ def check_policy(
 
 def check_update(update: updates.Update) -> None:
     """Raises ValueError for what is no update, or a function that makes one."""
+    # By its arguments, as there is no class of updates: ``full_batch`` itself takes none.
     try:
         inspect.signature(update).bind("problem", "key", "params", "opt_state")
     except (TypeError, ValueError):
-        got = f"{update.__name__}, which is to be called" if callable(update) else repr(update)
-        raise ValueError(f"update must be such as mjx_reinforce.full_batch(), got {got}") from None
+        text = f"{update.__name__}, which is to be called" if callable(update) else repr(update)
+        raise ValueError(f"update must be such as mjx_reinforce.full_batch(), got {text}") from None
 
 
 def check_estimator(
@@ -99,12 +107,13 @@ def check_estimator(
             f"this estimator needs at least {estimator.min_episodes} episodes per update, "
             f"got num_episodes={num_episodes}"
         )
-    shape, action = (_NUM_STEPS, num_episodes), null_action(env)
-    number = jnp.result_type(float)
+    shape = (_NUM_STEPS, num_episodes)
+    action = null_action(env)
+    float_dtype = jnp.result_type(float)
     trajectory = Trajectory(
-        observation=_shaped((*shape, observation_size), number),
+        observation=_shaped((*shape, observation_size), float_dtype),
         action=_shaped((*shape, *action.shape), action.dtype),
-        reward=_shaped(shape, number),
+        reward=_shaped(shape, float_dtype),
         mask=_shaped(shape, bool),
         nonfinite=_shaped((num_episodes,), bool),
         simulated=_shaped((), jnp.int32),
@@ -113,13 +122,13 @@ def check_estimator(
     def update(key, trajectory):
         return estimator.update(estimator.init(key, observation_size), trajectory)
 
-    returned = traced("estimator.init or update", update, jax.random.key(0), trajectory)
-    if not (isinstance(returned, tuple) and len(returned) == 3):
+    estimate = traced("estimator.init or update", update, jax.random.key(0), trajectory)
+    if not (isinstance(estimate, tuple) and len(estimate) == 3):
         raise ValueError(
             "estimator.update must return three things, (weight [T, N], next state, metrics), "
-            f"got {type(returned).__name__}"
+            f"got {type(estimate).__name__}"
         )
-    weight, _, metrics = returned
+    weight, _, metrics = estimate
     if getattr(weight, "shape", None) != shape or not jnp.issubdtype(weight.dtype, jnp.floating):
         raise ValueError(
             f"estimator.update must return a weight for every action, float [T, N], here "

@@ -162,6 +162,7 @@ def categorical(
       >>> family.mode(jnp.asarray([0.0, 1.0])).item()
       1
     """
+    # All families are called alike, see ``registry.DISTRIBUTIONS``; this one has no deviation.
     del initial_std, rescale
     check_space("categorical", space)
     if not isinstance(space, Discrete):
@@ -174,6 +175,7 @@ def categorical(
         return jnp.argmax(scores, axis=-1).astype(jnp.int32)
 
     def log_prob(outputs, action):
+        # By a mask and not by an index: the gradient of a gather is a scatter, slow on GPUs.
         chosen = jnp.arange(size) == action[..., None]
         return jnp.sum(jnp.where(chosen, jax.nn.log_softmax(outputs), 0.0), axis=-1)
 
@@ -181,10 +183,10 @@ def categorical(
         log_probs = jax.nn.log_softmax(outputs)
         return -jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1)
 
-    def kl(outputs, others):
+    def kl(outputs, other_outputs):
         log_probs = jax.nn.log_softmax(outputs)
-        apart = log_probs - jax.nn.log_softmax(others)
-        return jnp.sum(jnp.exp(log_probs) * apart, axis=-1)
+        log_ratio = log_probs - jax.nn.log_softmax(other_outputs)
+        return jnp.sum(jnp.exp(log_probs) * log_ratio, axis=-1)
 
     return Distribution(
         num_outputs=size,
@@ -225,7 +227,8 @@ class GaussianOutputs(NamedTuple):
 
     def split(self, outputs: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Returns the means and standard deviations, [..., A] each."""
-        raw, initial = outputs[..., self.size :], self.initial_std
+        raw = outputs[..., self.size :]
+        initial = self.initial_std
         # A fresh network's outputs are near 0; the added constants make the std initial_std there.
         if self.std == "parameter":
             std = jnp.exp(raw)
@@ -234,6 +237,7 @@ class GaussianOutputs(NamedTuple):
             offset = np.where(initial < 30, np.log(np.expm1(np.minimum(initial, 30))), initial)
             std = jax.nn.softplus(raw + offset.astype(raw.dtype)) + _MIN_STD
         else:
+            # The inverse of the sigmoid at the initial std.
             offset = np.log(initial / (1.0 - initial))
             std = jax.nn.sigmoid(raw + offset.astype(raw.dtype)) + _MIN_STD
         return self.mean(outputs), std
@@ -258,10 +262,16 @@ class GaussianOutputs(NamedTuple):
           kl: (mean, std, other mean, other std) -> that of each entry, in nats.
           noise: (key, shape) -> what ``sample`` transforms.
         """
-        constant = self.std == "parameter"
+        # The network computes mean and std, or the mean alone. The entries of an action are
+        # independent, so log-densities, entropies and divergences are sums over them.
+        num_outputs = 2 * self.size
+        constants = ()
+        if self.std == "parameter":
+            num_outputs = self.size
+            constants = _logs(self.initial_std, self.size)
         return Distribution(
-            num_outputs=self.size if constant else 2 * self.size,
-            constants=_logs(self.initial_std, self.size) if constant else (),
+            num_outputs=num_outputs,
+            constants=constants,
             noise=lambda key, shape: noise(key, (*shape, self.size)),
             sample=lambda outputs, noise: sample(noise, *self.split(outputs)),
             mode=lambda outputs: mode(self.mean(outputs)),
@@ -270,8 +280,8 @@ class GaussianOutputs(NamedTuple):
             ),
             entropy=lambda outputs: jnp.sum(entropy(*self.split(outputs)), axis=-1),
             std=lambda outputs: self.split(outputs)[1],
-            kl=lambda outputs, others: jnp.sum(
-                kl(*self.split(outputs), *self.split(others)), axis=-1
+            kl=lambda outputs, other_outputs: jnp.sum(
+                kl(*self.split(outputs), *self.split(other_outputs)), axis=-1
             ),
         )
 
@@ -304,6 +314,7 @@ def gaussian_outputs(
     middle, half = middle_and_half_range(space)
     if initial_std is None:
         initial_std = default_std(space)
+        # A sigmoid stays below 1, whatever the action's range.
         if std == "sigmoid":
             initial_std = np.minimum(initial_std, _STD_SHARE)
     shape = np.shape(initial_std)
@@ -312,6 +323,7 @@ def gaussian_outputs(
             f"initial_std must be a number, or {list(middle.shape)}, one for each entry, "
             f"got {initial_std}"
         )
+    # One by one: an entry may be traced, and is then taken on trust.
     for entry in initial_std if shape else (initial_std,):  # type: ignore[union-attr]
         check_number("initial_std", entry, positive=True)
         number = known_number(entry)
@@ -321,7 +333,8 @@ def gaussian_outputs(
                 "give a smaller one, or choose normal"
             )
     if not rescale:
-        middle, half = np.zeros_like(middle), np.ones_like(half)
+        middle = np.zeros_like(middle)
+        half = np.ones_like(half)
     if not isinstance(initial_std, jax.core.Tracer):
         initial_std = np.asarray(initial_std, float)
     return GaussianOutputs(space, std, initial_std, middle, half)
@@ -358,6 +371,7 @@ def normal_kl(
     means d apart, arranged so that nearly equal ones do not cancel.
     """
     log_ratio = jnp.log(std / other_std)
+    # What the standard deviations contribute: p^2 / (2 q^2) - 1/2 is half expm1(2 log(p / q)).
     width = 0.5 * jnp.expm1(2.0 * log_ratio) - log_ratio
     return width + 0.5 * ((mean - other_mean) / other_std) ** 2
 
@@ -376,7 +390,10 @@ def middle_and_half_range(space: Box) -> tuple[np.ndarray, np.ndarray]:
 
     They are 0 and 1 for an entry that is not bounded on both sides.
     """
-    low, high = np.asarray(space.low, np.float32), np.asarray(space.high, np.float32)
+    low = np.asarray(space.low, np.float32)
+    high = np.asarray(space.high, np.float32)
+    # The range [-1, 1] has the center 0 and the half width 1.
     bounded = np.isfinite(low) & np.isfinite(high)
-    low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+    low = np.where(bounded, low, -1.0)
+    high = np.where(bounded, high, 1.0)
     return (low + high) / 2, (high - low) / 2

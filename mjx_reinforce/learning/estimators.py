@@ -118,12 +118,14 @@ def _less_others(
     check_discount(discount)
 
     def update(state, trajectory):
+        """Returns G[t, n] - b[t, n] with the baseline b, the mean G[t] of the other episodes."""
         returns = _returns(trajectory, discount)
+        # Sums over all episodes [T, 1] less the own term: N means in one pass, not N times N - 1.
         counted = counts(trajectory.mask)
-        others = jnp.sum(counted, axis=1, keepdims=True) - counted
+        num_others = jnp.sum(counted, axis=1, keepdims=True) - counted
         sums = jnp.sum(jnp.where(counted, returns, 0.0), axis=1, keepdims=True)
-        baseline = (sums - jnp.where(counted, returns, 0.0)) / jnp.maximum(others, 1)
-        weight = returns - jnp.where(others > 0, baseline, 0.0)
+        baseline = (sums - jnp.where(counted, returns, 0.0)) / jnp.maximum(num_others, 1)
+        weight = returns - jnp.where(num_others > 0, baseline, 0.0)
         weight = jnp.where(trajectory.mask, weight, 0.0)
         explained = explained_variance(weight, returns, trajectory.mask)
         return weight, state, {"explained_variance": explained}
@@ -159,13 +161,19 @@ def standardize(
     check_number("floor", floor, finite=False)
 
     def update(state, trajectory):
+        """Returns the weights [T, N] over their deviation, and the deviation among the metrics."""
         weight, state, metrics = estimator.update(state, trajectory)
         mask = trajectory.mask
         steps = jnp.maximum(jnp.sum(mask), 1)
-        mean = jnp.sum(jnp.where(mask, weight, 0.0)) / steps if center else 0.0
+        mean = 0.0
+        if center:
+            mean = jnp.sum(jnp.where(mask, weight, 0.0)) / steps
+        # In a unit in which the squares do not overflow.
         unit = _unit(jnp.where(mask, weight - mean, 0.0))
         variance = jnp.sum(jnp.where(mask, ((weight - mean) / unit) ** 2, 0.0)) / steps
         std = unit * jnp.sqrt(variance)
+        # What summing the rewards of an episode may round, [N]; an episode that broke has no
+        # rewards to speak of.
         rounding = jnp.sum(jnp.finfo(weight.dtype).eps * jnp.abs(trajectory.reward), axis=0)
         varies = std + floor > jnp.max(jnp.where(trajectory.nonfinite, 0.0, rounding))
         scaled = jnp.where(mask & varies, (weight - mean) / (std + floor), 0.0)
@@ -193,6 +201,7 @@ def discount_weights(estimator: Estimator, discount: float | jax.Array = 0.99) -
 
     def update(state, trajectory):
         weight, state, metrics = estimator.update(state, trajectory)
+        # [T]; with a discount of 0 the first step alone counts, since 0^0 is 1.
         powers = discount ** jnp.arange(weight.shape[0], dtype=weight.dtype)
         return weight * powers[:, None], state, metrics
 
@@ -227,8 +236,10 @@ def explained_variance(residual: jax.Array, returns: jax.Array, mask: jax.Array)
     """
     steps = jnp.maximum(jnp.sum(mask), 1)
 
+    # The ratio does not depend on the unit, but squares of large returns would overflow.
     unit = _unit(jnp.where(mask, returns, 0.0))
-    residual, returns = residual / unit, returns / unit
+    residual = residual / unit
+    returns = returns / unit
 
     def mean(x):
         return jnp.sum(jnp.where(mask, x, 0.0)) / steps
@@ -237,6 +248,7 @@ def explained_variance(residual: jax.Array, returns: jax.Array, mask: jax.Array)
         return mean((x - mean(x)) ** 2)
 
     total = variance(returns)
+    # A deviation of 1e-6 of the mean is some ten roundings of float32.
     varies = total > 1e-12 * mean(returns) ** 2
     return jnp.where(varies, 1.0 - variance(residual) / jnp.where(varies, total, 1.0), jnp.nan)
 
@@ -266,14 +278,18 @@ def discounted_returns(reward: jax.Array, discount: float | jax.Array) -> jax.Ar
     discount = jnp.asarray(discount, reward.dtype)
     horizon, num_episodes = reward.shape
     length = math.isqrt(horizon - 1) + 1
-    count = -(-horizon // length)
-    blocks = jnp.pad(reward, ((0, count * length - horizon), (0, 0)))
-    blocks = blocks.reshape(count, length, num_episodes)
-    own = _discounted_sums(blocks, discount)
-    total = _discounted_sums(own[:, 0], jnp.power(discount, length))
+    num_blocks = -(-horizon // length)
+    # Zeros after the end change no return before it: [B, L, N] with B L >= T.
+    blocks = jnp.pad(reward, ((0, num_blocks * length - horizon), (0, 0)))
+    blocks = blocks.reshape(num_blocks, length, num_episodes)
+    # G within each block, as if nothing came after it.
+    block_returns = _discounted_sums(blocks, discount)
+    # G at the first step of each block [B, N], where a step from block to block is L steps.
+    total = _discounted_sums(block_returns[:, 0], jnp.power(discount, length))
+    # What the next block adds, from L, L - 1, ..., 1 steps away.
     later = jnp.pad(total[1:], ((0, 1), (0, 0)))
     steps_left = jnp.arange(length, 0, -1, dtype=reward.dtype)
-    returns = own + jnp.power(discount, steps_left)[:, None] * later[:, None]
+    returns = block_returns + jnp.power(discount, steps_left)[:, None] * later[:, None]
     return returns.reshape(-1, num_episodes)[:horizon]
 
 
@@ -295,6 +311,8 @@ def replace_broken(returns: jax.Array, broken: jax.Array) -> jax.Array:
 def _discounted_sums(x: jax.Array, discount: jax.Array) -> jax.Array:
     """Returns y [..., T, N] with ``y[t] = x[t] + discount * y[t + 1]`` and ``y[T] = 0``."""
     time = jnp.arange(x.shape[-2], dtype=x.dtype)
+    # A matrix [T, T] of discount^(s - t) where s >= t, else 0. The exponent is clipped besides:
+    # a negative power of 0 is infinite.
     ahead = time - time[:, None]
     factors = jnp.where(ahead < 0, 0, jnp.power(discount, jnp.maximum(ahead, 0)))
     return jnp.matmul(factors, x, precision="highest")

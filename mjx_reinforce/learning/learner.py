@@ -22,7 +22,7 @@ from mjx_reinforce.engine.episode import check_each, episode_keys
 from mjx_reinforce.engine.play import choice
 from mjx_reinforce.engine.play.choice import Engine, Rollout
 from mjx_reinforce.engine.play.rollouts import episode_lengths, episode_returns
-from mjx_reinforce.learning import contract, counts, diagnostics, normalize
+from mjx_reinforce.learning import contract, counts, diagnostics, normalize, trust_region
 from mjx_reinforce.learning.diagnostics import Metrics
 from mjx_reinforce.learning.distributions import default_distribution
 from mjx_reinforce.learning.estimators import Estimator, leave_one_out, standardize
@@ -108,18 +108,24 @@ class Learner(NamedTuple):
           state: from ``init`` or the step before.
           active: [] where False nothing is played and the state stays.
         """
-        key, play_key, learn_key = jax.random.split(state.key, 3)
-        played = self.play(state, play_key, active)
-        learned, metrics = self.learn(state, played, learn_key)
-        after = dataclasses.replace(
-            learned,
-            key=key,
+        # One key is carried on, two are consumed: no key is ever used twice.
+        next_key, play_key, learn_key = jax.random.split(state.key, 3)
+        episodes = self.play(state, play_key, active)
+        next_state, metrics = self.learn(state, episodes, learn_key)
+        # Counted here and not in ``learn``, which may have kept the old state: a skipped update has
+        # played its episodes, too.
+        next_state = dataclasses.replace(
+            next_state,
+            key=next_key,
             num_updates=counts.plus(state.num_updates, 1),
             env_steps=counts.plus(state.env_steps, metrics["env_steps"]),
         )
+        # Under ``vmap`` over seeds some may be at their end while others go on.
         if active is not True:
-            after = jax.tree.map(lambda new, old: jnp.where(active, new, old), after, state)
-        return after, metrics
+            next_state = jax.tree.map(
+                lambda new, old: jnp.where(active, new, old), next_state, state
+            )
+        return next_state, metrics
 
     def act(self, actor: Actor, observation: jax.Array) -> jax.Array:
         """Returns the outputs [..., K] of the policy's distribution; see ``policy.act``."""
@@ -166,7 +172,7 @@ def reinforce(
       max_kl: the most, in nats, by which an update may move the policy: the mean over the steps
         that it visited, 64 of them, of KL(before || after), with the scale of the observations
         that each has. A change that goes further is shortened, the scale with it, see
-        ``diagnostics.within_kl``; None shortens none.
+        ``trust_region.within_kl``; None shortens none.
       normalize_steps: scale observations by the mean and std of about the first so many steps,
         then keep that scale; 0 does not scale, inf never stops. (Where a policy learns to keep
         the state near the middle, statistics that never stop shrink, and magnify the
@@ -202,17 +208,21 @@ def reinforce(
         policy = mlp_policy(size, default_distribution(action_space(env)))
     contract.check_policy(policy, env, size, likelihood=True)
     policy = within_bounds(policy, action_space(env))
-    optimizer = make_optimizer() if optimizer is None else optimizer
+    if optimizer is None:
+        optimizer = make_optimizer()
     check_kind("optimizer", optimizer, optax.GradientTransformation, "optax.adam(1e-2)")
-    update = full_batch() if update is None else update
+    if update is None:
+        update = full_batch()
     contract.check_update(update)
-    estimator = standardize(leave_one_out(), floor=10.0) if estimator is None else estimator
+    if estimator is None:
+        estimator = standardize(leave_one_out(), floor=10.0)
     contract.check_estimator(estimator, env, size, num_episodes)
 
-    example = jax.eval_shape(functools.partial(first_actor, policy, size), jax.random.key(0))
-    # The parameters, their gradient, and what they become.
-    check_room(3.0 * sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(example)))
-    acting = choice.ActingPolicy(functools.partial(act, policy), example, policy.distribution)
+    # Shapes alone, so that a network that is too large is refused before it takes its memory.
+    actor_shapes = jax.eval_shape(functools.partial(first_actor, policy, size), jax.random.key(0))
+    # Three times: the parameters, their gradient, and what they become.
+    check_room(3.0 * sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(actor_shapes)))
+    acting = choice.ActingPolicy(functools.partial(act, policy), actor_shapes, policy.distribution)
     parts = _Reinforce(
         env=env,
         policy=policy,
@@ -223,7 +233,8 @@ def reinforce(
         horizon=horizon,
         entropy_cost=entropy_cost,
         max_kl=max_kl,
-        normalize_limits=(normalize_steps, normalize_min_std),
+        normalize_steps=normalize_steps,
+        normalize_min_std=normalize_min_std,
         engine=choice.choose(engine, env, acting, horizon),
     )
     return Learner(parts.init, parts.play, parts.learn, policy, parts.engine)
@@ -247,12 +258,14 @@ class _Reinforce:
     horizon: int
     entropy_cost: float | jax.Array
     max_kl: float | jax.Array | None
-    normalize_limits: tuple[float, float | jax.Array]
+    normalize_steps: float
+    normalize_min_std: float | jax.Array
     engine: Engine
 
     def init(self, key: jax.Array) -> TrainState:
         """``Learner.init``."""
         check_key(key)
+        # The third key is the seed's own, from which every later key is split.
         policy_key, estimator_key, key = jax.random.split(key, 3)
         size = observation_size(self.env)
         actor = first_actor(self.policy, size, policy_key)
@@ -272,6 +285,7 @@ class _Reinforce:
     ) -> Trajectory:
         """``Learner.play``; what is wrapped around it may play by another rollout."""
         check_each(self.num_episodes, active=active)
+        # A wrapper that cuts episodes or resets all alike puts its own rollout around the engine's.
         rollout = self.engine.rollout if rollout is None else rollout
         return rollout(
             self.env,
@@ -287,47 +301,90 @@ class _Reinforce:
     def learn(
         self, state: TrainState, trajectory: Trajectory, key: jax.Array
     ) -> tuple[TrainState, Metrics]:
-        """``Learner.learn``: the update, in the order of the formula."""
-        before, visited = state.actor, diagnostics.visited_steps(trajectory)
-        # A return that overflows is none, either.
+        """``Learner.learn``: the update, in the order of the formula of ``reinforce``.
+
+        Shapes are [T, N]: T steps of each of N episodes, of which those in the mask were played.
+        """
+        # The actor that played: theta, the parameters of pi, and the scale of its observations.
+        before = state.actor
+        # The few steps at which the policies before and after the update are compared.
+        visited = diagnostics.visited_steps(trajectory)
+
+        # An episode whose return overflows float32 counts as broken [N], as one does in which the
+        # simulation left the finite numbers: its return compares with nothing.
         overflow = ~jnp.isfinite(episode_returns(trajectory))
         trajectory = trajectory.replace(nonfinite=trajectory.nonfinite | overflow)
-        # Normalize, weigh, follow the gradient, limit the change, count, keep what is finite.
-        seen = normalize.seen(before.normalizer, trajectory)
-        weight, estimator_state, metrics = self.estimator.update(state.estimator_state, seen)
-        problem = self._problem(state, seen, weight)
-        params, opt_state, measured = self.update(problem, key, before.params, state.opt_state)
-        counted = trajectory.mask & ~trajectory.nonfinite
-        normalizer = normalize.update(
-            before.normalizer, trajectory.observation, counted, *self.normalize_limits
+
+        # o[t, n]: observations [T, N, O] as the policy saw them, in the scale of ``before``. The
+        # scale of after the update would give the actions other probabilities than they had.
+        scaled = normalize.scale_observations(before.normalizer, trajectory)
+
+        # w[t, n]: the weights [T, N] of the score (Williams 1992, equation 8), from rewards, and
+        # from observations where a baseline is learned. That baseline is in ``estimator_state``. It
+        # is fitted to these returns after it was subtracted from them: one that had seen an
+        # action's own return would bias the gradient.
+        weight, estimator_state, estimator_metrics = self.estimator.update(
+            state.estimator_state, scaled
         )
-        proposed = Actor(params=params, normalizer=normalizer)
-        actor = diagnostics.within_kl(self.policy, before, proposed, visited, self.max_kl)
+
+        # theta: the optimizer's steps. The value of the surrogate means nothing; its gradient at
+        # the old theta is minus the formula's.
+        problem = self._problem(state, scaled, weight)
+        params, opt_state, step_metrics = self.update(problem, key, before.params, state.opt_state)
+
+        # The next scale, from the raw observations: scaled ones would always have mean 0 and
+        # standard deviation 1. An episode that broke is left out whole.
+        sound_steps = trajectory.mask & ~trajectory.nonfinite
+        normalizer = normalize.update(
+            before.normalizer,
+            trajectory.observation,
+            sound_steps,
+            at_most=self.normalize_steps,
+            min_std=self.normalize_min_std,
+        )
+
+        # A trust region (Schulman et al. 2015, arXiv:1502.05477): parameters and scale both change
+        # what the policy does, so the two are shortened together.
+        proposal = Actor(params=params, normalizer=normalizer)
+        actor = trust_region.within_kl(self.policy, before, proposal, visited, self.max_kl)
         after = state.replace(actor=actor, opt_state=opt_state, estimator_state=estimator_state)
+
         # Without one sound episode, or with a norm that overflows, the step would say nothing.
         sound = ~jnp.all(trajectory.nonfinite)
-        sound &= jnp.isfinite(measured.get("gradient_norm", 0.0))
+        sound &= jnp.isfinite(step_metrics.get("gradient_norm", 0.0))
         after, skipped = keep_finite(after, state, sound)
 
+        # Measured of the actor that was kept, at the same steps at which the change was limited.
         change = diagnostics.policy_metrics(self.policy, before, after.actor, visited)
-        return after, update_metrics(trajectory, skipped, metrics | measured | change)
+        measurements = estimator_metrics | step_metrics | change
+        return after, update_metrics(trajectory, skipped, measurements)
 
-    def _problem(self, state: TrainState, seen: Trajectory, weight: jax.Array) -> Problem:
-        """Returns minus the sum in the formula, and all else that an ``Update`` reads."""
+    def _problem(self, state: TrainState, scaled: Trajectory, weight: jax.Array) -> Problem:
+        """Returns minus the sum in the formula, and all else that an ``Update`` reads.
+
+        Args:
+          state: before the update.
+          scaled: [T, N] what was played, with scaled observations.
+          weight: [T, N] w, from the estimator.
+        """
         distribution = self.policy.distribution
 
         def surrogate(params, samples):
+            """Returns minus the sum [] over samples, and the sum of their entropies H."""
             observation, action, weight, mask = samples
             outputs = self.policy.apply(params, observation)
             entropy = distribution.entropy(outputs)
+            # No gradient flows into the weight, which is data here. Minus, as optimizers descend.
             terms = distribution.log_prob(outputs, action) * weight + self.entropy_cost * entropy
+            # Where no step was played, the numbers may be anything, NaN too: 0 times NaN is NaN.
             loss = -jnp.sum(jnp.where(mask, terms, 0.0))
             return loss, {"entropy": jnp.sum(jnp.where(mask, entropy, 0.0))}
 
         return Problem(
             surrogate=surrogate,
             optimizer=self.optimizer,
-            samples=(seen.observation, seen.action, weight, seen.mask),
+            samples=(scaled.observation, scaled.action, weight, scaled.mask),
+            # By N, not by the steps that were played, which depend on the policy.
             divisor=self.num_episodes,
             clock=Clock(state.progress, counts.as_float(state.env_steps)),
         )
@@ -368,30 +425,38 @@ def train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics
       >>> metrics["episodes"].item(), metrics["episode_return"].shape
       (4, ())
     """
+    # Before it is traced: of a wrong argument, jit would say that it is no JAX type.
     check_kind("state", state, TrainState, "learner.init(jax.random.key(0))")
     return _step(learner, state)
 
 
+# All that a jitted function has besides, to compile ahead of time and to see shapes and costs.
+vars(train_step).update(
+    {name: getattr(_step, name) for name in ("lower", "eval_shape", "trace", "clear_cache")}
+)
+
+
 def keep_finite(
-    learned: TrainState, before: TrainState, sound: jax.Array | bool = True
+    candidate: TrainState, before: TrainState, sound: jax.Array | bool = True
 ) -> tuple[TrainState, jax.Array]:
-    """Returns ``learned`` and 0 if all of it is finite and sound, else ``before`` and 1.
+    """Returns ``candidate`` and 0 if all of it is finite and sound, else ``before`` and 1.
 
     So an update that breaks costs its seed that one update.
     """
     # Floats are joined into one vector for the choice. With a choice for each leaf XLA's CPU
     # backend makes a program for each, and each of them computes again what they share.
-    new, unravel = ravel_pytree(list(filter(is_float, jax.tree.leaves(learned))))
-    old, _ = ravel_pytree(list(filter(is_float, jax.tree.leaves(before))))
-    finite = jnp.all(jnp.isfinite(new)) & sound
-    floats = iter(unravel(jnp.where(finite, new, old)))
+    new_floats, unravel = ravel_pytree(list(filter(is_float, jax.tree.leaves(candidate))))
+    old_floats, _ = ravel_pytree(list(filter(is_float, jax.tree.leaves(before))))
+    finite = jnp.all(jnp.isfinite(new_floats)) & sound
+    chosen_floats = iter(unravel(jnp.where(finite, new_floats, old_floats)))
 
-    def choose(x: jax.Array, y: jax.Array) -> jax.Array:
-        if is_float(x):
-            return next(floats)
-        return x if x is y else jnp.where(finite, x, y)  # no update touches the key
+    def choose(new: jax.Array, old: jax.Array) -> jax.Array:
+        # ``jax.tree.map`` visits leaves in the order of ``jax.tree.leaves`` above.
+        if is_float(new):
+            return next(chosen_floats)
+        return new if new is old else jnp.where(finite, new, old)  # no update touches the key
 
-    return jax.tree.map(choose, learned, before), jnp.where(finite, 0, 1)
+    return jax.tree.map(choose, candidate, before), jnp.where(finite, 0, 1)
 
 
 def is_float(x: jax.Array) -> bool:
@@ -399,17 +464,19 @@ def is_float(x: jax.Array) -> bool:
     return jnp.issubdtype(x.dtype, jnp.floating)
 
 
-def update_metrics(trajectory: Trajectory, skipped: jax.Array, measured: Metrics) -> Metrics:
+def update_metrics(trajectory: Trajectory, skipped: jax.Array, measurements: Metrics) -> Metrics:
     """Returns the metrics of an update, see ``train_step``.
 
     Args:
       trajectory: what was played.
       skipped: [] 1 if the update was not finite, else 0.
-      measured: what else is known of the update; its floats are NaN where that was not finite.
+      measurements: the rest of the metrics; their floats are NaN where the update was not finite.
     """
-    returns, lengths = episode_returns(trajectory), episode_lengths(trajectory)
+    returns = episode_returns(trajectory)
+    lengths = episode_lengths(trajectory)
+    # Means over steps of which some are garbage say nothing. NaN is a gap in a chart, 0 a value.
     sound = (skipped == 0) & ~jnp.any(trajectory.nonfinite)
-    floats = {name: jnp.where(sound, x, jnp.nan) for name, x in measured.items() if is_float(x)}
+    floats = {name: jnp.where(sound, x, jnp.nan) for name, x in measurements.items() if is_float(x)}
     return {
         "episodes": jnp.int32(trajectory.mask.shape[1]),
         "episode_return": jnp.mean(returns),
@@ -419,6 +486,6 @@ def update_metrics(trajectory: Trajectory, skipped: jax.Array, measured: Metrics
         "env_steps": jnp.sum(lengths),
         "simulated_steps": trajectory.simulated,
         "nonfinite_episodes": jnp.sum(trajectory.nonfinite),
-        **(measured | floats),
+        **(measurements | floats),
         "skipped_update": skipped,
     }

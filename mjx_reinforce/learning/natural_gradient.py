@@ -88,10 +88,14 @@ def natural_gradient(
     solve = _by_conjugate_gradients(policy, damping, iterations)
 
     def turn(problem, key, params, gradient):
+        """Returns the step, sqrt(2 max_kl / g'x) x with x = (F + damping I)^-1 g, a pytree."""
         flat, unravel = ravel_pytree(gradient)
+        # The step does not depend on the length of g; of a unit vector nothing over- or underflows.
         norm = jnp.linalg.norm(flat)
         unit = flat / jnp.where(norm > 0, norm, 1.0)
         direction = ravel_pytree(solve(problem, key, params, unravel(unit)))[0]
+        # g'x is positive, as the matrix is positive definite; without a gradient it is 0, and the
+        # policy stays.
         slope = jnp.vdot(unit, direction, precision="highest")
         length = jnp.where(slope > 0, jnp.sqrt(2 * max_kl / jnp.where(slope > 0, slope, 1.0)), 0.0)
         return unravel((length * direction).astype(flat.dtype))
@@ -105,8 +109,11 @@ def _by_conjugate_gradients(
     """Returns what solves with products of F alone."""
 
     def solve(problem, key, params, gradient):
+        """Returns (F + damping I)^-1 gradient, a pytree, from S of the visited steps."""
         observation, *_, mask = problem.samples
         observation = observation.reshape(mask.size, -1)
+        # The share [S] of each step in the mean over the visited ones. Steps that are drawn are all
+        # inside the mask; otherwise those outside have no share.
         if mask.size > MAX_FISHER_STEPS:
             observation = observation[draw_steps(key, mask, (MAX_FISHER_STEPS,))]
             share = jnp.full(MAX_FISHER_STEPS, 1 / MAX_FISHER_STEPS)
@@ -116,18 +123,23 @@ def _by_conjugate_gradients(
         def outputs(params):
             return policy.apply(params, observation)
 
-        old, push = jax.linearize(outputs, params)
-        pull = jax.linear_transpose(push, params)
+        # J v and J^T u at the old parameters: the network is linearized once, not in each product.
+        old_outputs, jacobian_product = jax.linearize(outputs, params)
+        transpose_product = jax.linear_transpose(jacobian_product, params)
 
-        def distance(new):
-            return jnp.sum(share * policy.distribution.kl(old, new))  # type: ignore[misc]
+        def mean_kl(new_outputs):
+            kl = policy.distribution.kl
+            return jnp.sum(share * kl(old_outputs, new_outputs))  # type: ignore[misc]
 
-        curve = jax.linearize(jax.grad(distance), old)[1]
+        # H u: the derivative of KL's gradient in the outputs [S, K], at new = old.
+        hessian_product = jax.linearize(jax.grad(mean_kl), old_outputs)[1]
 
         flat, unravel = ravel_pytree(gradient)
 
         def damped_fisher(vector):
-            (product,) = pull(curve(push(unravel(vector))))
+            # F v = J^T H J v, from right to left: F itself, [P, P] for P parameters, is not made.
+            outputs_change = jacobian_product(unravel(vector))
+            (product,) = transpose_product(hessian_product(outputs_change))
             return ravel_pytree(product)[0] + jnp.asarray(damping, flat.dtype) * vector
 
         cg = jax.scipy.sparse.linalg.cg

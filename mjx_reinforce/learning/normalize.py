@@ -61,19 +61,24 @@ def update(
     Returns:
       The statistics of both together, or those so far.
     """
+    # With an empty mask the batch has no weight, and everything below leaves the statistics alone:
+    # there is no branch, which would be run both ways under ``vmap`` anyway.
     mask = mask & (normalizer.count < at_most)
-    kept = mask[..., None]
+    inside = mask[..., None]
     observation = jnp.clip(observation, -_LARGEST, _LARGEST)
     count = jnp.sum(mask, dtype=normalizer.count.dtype)
     divisor = jnp.maximum(count, 1.0)
-    mean = jnp.sum(jnp.where(kept, observation, 0.0), axis=(0, 1)) / divisor
-    m2 = jnp.sum(jnp.where(kept, (observation - mean) ** 2, 0.0), axis=(0, 1))
+    mean = jnp.sum(jnp.where(inside, observation, 0.0), axis=(0, 1)) / divisor
+    m2 = jnp.sum(jnp.where(inside, (observation - mean) ** 2, 0.0), axis=(0, 1))
     total = jnp.maximum(normalizer.count + count, 1.0)
     delta = mean - normalizer.mean
-    # XLA would compile the sums below otherwise beside ``_moved``, and round them otherwise.
-    apart = jax.lax.optimization_barrier((normalizer, count, delta, m2))
+    # XLA would compile the sums below otherwise beside ``_m2_of_long_count``, and round them
+    # otherwise.
+    operands = jax.lax.optimization_barrier((normalizer, count, delta, m2))
+    # Chan et al.: the squares within each part, and those between the parts' means.
     m2 = normalizer.m2 + m2 + delta**2 * normalizer.count * count / total
-    m2 = jnp.where(total > _EXACT, _moved(*apart), m2)
+    m2 = jnp.where(total > _EXACT, _m2_of_long_count(*operands), m2)
+    # The floor goes into m2: ``apply`` has the statistics alone, and knows no floor.
     return Normalizer(
         count=normalizer.count + count,
         mean=normalizer.mean + delta * count / total,
@@ -81,7 +86,9 @@ def update(
     )
 
 
-def _moved(normalizer: Normalizer, count: jax.Array, delta: jax.Array, m2: jax.Array) -> jax.Array:
+def _m2_of_long_count(
+    normalizer: Normalizer, count: jax.Array, delta: jax.Array, m2: jax.Array
+) -> jax.Array:
     """Returns the sum of squares [O] of a long count and a batch, whose count is rounded.
 
     That rounding would tell in the ratio of two long sums: a batch moves the variance by the share
@@ -94,10 +101,11 @@ def _moved(normalizer: Normalizer, count: jax.Array, delta: jax.Array, m2: jax.A
       m2: [O] its sum of squares.
     """
     total = jnp.maximum(normalizer.count + count, 1.0)
-    before = normalizer.m2 / jnp.maximum(normalizer.count, 1.0)
+    variance = normalizer.m2 / jnp.maximum(normalizer.count, 1.0)
+    # Not ``count``: what of it is left where float32 rounds the long count.
     share = (normalizer.count + count - normalizer.count) / total
-    apart = m2 / jnp.maximum(count, 1.0) + delta**2 * normalizer.count / total - before
-    return (before + share * apart) * total
+    excess = m2 / jnp.maximum(count, 1.0) + delta**2 * normalizer.count / total - variance
+    return (variance + share * excess) * total
 
 
 def between(before: Normalizer, after: Normalizer, share: jax.Array) -> Normalizer:
@@ -105,11 +113,13 @@ def between(before: Normalizer, after: Normalizer, share: jax.Array) -> Normaliz
 
     Before the first observation the scale is 1, and it moves from there.
     """
-    part = jax.tree.map(lambda old, new: old + share * (new - old), before, after)
+    partway = jax.tree.map(lambda old, new: old + share * (new - old), before, after)
+    # The variance goes from 1 to the first one; m2 is the count times that.
     variance = after.m2 / jnp.maximum(after.count, 1.0)
-    first = part.count * (1.0 + share * (variance - 1.0))
-    part = part.replace(m2=jnp.where(before.count > 0, part.m2, first))
-    return jax.tree.map(lambda some, new: jnp.where(share < 1.0, some, new), part, after)
+    first_m2 = partway.count * (1.0 + share * (variance - 1.0))
+    partway = partway.replace(m2=jnp.where(before.count > 0, partway.m2, first_m2))
+    # old + 1 * (new - old) is not new in floating point.
+    return jax.tree.map(lambda old, new: jnp.where(share < 1.0, old, new), partway, after)
 
 
 def apply(normalizer: Normalizer, observation: jax.Array) -> jax.Array:
@@ -122,8 +132,8 @@ def apply(normalizer: Normalizer, observation: jax.Array) -> jax.Array:
     return jnp.where(normalizer.count > 0, scaled, observation)
 
 
-def seen(normalizer: Normalizer, trajectory: Trajectory) -> Trajectory:
-    """Returns a trajectory with scaled observations."""
+def scale_observations(normalizer: Normalizer, trajectory: Trajectory) -> Trajectory:
+    """Returns a trajectory with scaled observations [T, N, O]."""
     return trajectory.replace(observation=apply(normalizer, trajectory.observation))
 
 

@@ -45,6 +45,7 @@ class MLP(nn.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         """Returns [..., num_outputs] of ``x`` [..., O]; ValueError: unknown initializer."""
         check_name("initializer", self.initializer, dict.fromkeys(INITIALIZERS))
+        # Written out as scalar code, a network is a loop over its units: see ``units``.
         if units.wanted(x) and not self.is_initializing():
             params = self.variables["params"]
             return units.tanh_network([params[f"Dense_{i}"] for i in range(len(params))], x)
@@ -54,6 +55,7 @@ class MLP(nn.Module):
 
     def _dense(self, x: jax.Array, size: int, kernel_init: nn.initializers.Initializer):
         bias_init = nn.initializers.zeros
+        # PyTorch draws biases from the same range as weights, by the layer's inputs.
         if self.initializer == "torch":
             kernel_init = bias_init = _symmetric_uniform(x.shape[-1] ** -0.5)
         return nn.Dense(size, kernel_init=kernel_init, bias_init=bias_init, precision=_PRECISION)(x)
@@ -63,7 +65,7 @@ def _symmetric_uniform(bound: float) -> nn.initializers.Initializer:
     """Returns an initializer that draws from the uniform distribution on (-bound, bound)."""
 
     def draw(key, shape, dtype=float, out_sharding=None):
-        del out_sharding
+        del out_sharding  # of the signature of JAX's initializers
         return jax.random.uniform(key, shape, dtype, -bound, bound)
 
     return draw
@@ -134,6 +136,7 @@ def mlp_policy(
     if any(size < 1 for size in hidden_sizes):
         raise ValueError(f"every hidden layer needs at least one unit, got {hidden_sizes}")
     check_name("initializer", initializer, dict.fromkeys(INITIALIZERS))
+    # With small last weights an untrained policy does nearly the same everywhere, see ``MLP``.
     network = MLP(tuple(hidden_sizes), distribution.num_outputs, 0.01, initializer)
     constants = distribution.constants
 
@@ -143,8 +146,10 @@ def mlp_policy(
 
     def apply(params, observation):
         outputs = jnp.asarray(network.apply(params["network"], observation))
-        fixed = jnp.broadcast_to(params["constants"], (*outputs.shape[:-1], len(constants)))
-        return jnp.concatenate([outputs, fixed], axis=-1)
+        # The same for all observations, and parameters still: the gradient sums over the steps.
+        shape = (*outputs.shape[:-1], len(constants))
+        constant_outputs = jnp.broadcast_to(params["constants"], shape)
+        return jnp.concatenate([outputs, constant_outputs], axis=-1)
 
     return Policy(init, apply, distribution)
 
@@ -161,9 +166,11 @@ def within_bounds(policy: Policy, space: Box | Discrete) -> Policy:
     def clip(action: jax.Array) -> jax.Array:
         return jnp.clip(action, *(jnp.asarray(bound, action.dtype) for bound in space))
 
+    # The sample and its log-probability stay those of the family: a clipped action would have the
+    # probability of a whole tail, and the score of the density would be wrong for it.
     family = policy.distribution
-    inside = family._replace(mode=lambda outputs: clip(family.mode(outputs)), clip=clip)
-    return policy._replace(distribution=inside)
+    clipped_family = family._replace(mode=lambda outputs: clip(family.mode(outputs)), clip=clip)
+    return policy._replace(distribution=clipped_family)
 
 
 class Actor(struct.PyTreeNode, kw_only=True):

@@ -51,6 +51,7 @@ class Cut(NamedTuple):
         Raises:
           ValueError: a number makes no sense, or ``reinforce`` did not make the learner.
         """
+        # Only the ``play`` of ``reinforce`` takes a rollout, to which a limit can be given.
         play_whole: Any = getattr(learner, "play", lambda: None)
         if "rollout" not in inspect.signature(play_whole).parameters:
             raise ValueError(f"a cut takes a learner of mjx_reinforce.reinforce, got {learner!r}")
@@ -60,9 +61,9 @@ class Cut(NamedTuple):
             raise ValueError(f"cut.until must be a share of the budget in [0, 1], got {self.until}")
 
         def play(state: Any, key: jax.Array, active: Any = True, rollout: Any = None) -> Any:
-            whole = learner.engine.rollout if rollout is None else rollout
-            shorter = functools.partial(whole, limit=self.limit(state.progress))
-            return play_whole(state, key, active, shorter)
+            full_rollout = learner.engine.rollout if rollout is None else rollout
+            cut_rollout = functools.partial(full_rollout, limit=self.limit(state.progress))
+            return play_whole(state, key, active, cut_rollout)
 
         return learner._replace(play=play)
 
@@ -86,9 +87,9 @@ def share(clock: Clock, env_steps: float | jax.Array | None) -> jax.Array:
     """
     if env_steps is None:
         return jnp.minimum(clock.progress, 1.0)
-    # An int beyond 2^31 would not fit into JAX's.
-    passed = clock.env_steps / jnp.asarray(env_steps, clock.env_steps.dtype)
-    return jnp.minimum(passed, 1.0)
+    # As a float: an int beyond 2^31 would not fit into JAX's.
+    fraction = clock.env_steps / jnp.asarray(env_steps, clock.env_steps.dtype)
+    return jnp.minimum(fraction, 1.0)
 
 
 def decay_rate(
@@ -103,6 +104,7 @@ def decay_rate(
 
     def update(updates, state, params=None, **rollout: Any):
         del params
+        # From the clock at the rollout's start: all steps of an update have the same rate.
         factor = 1 + (least - 1) * share(rollout["clock"], env_steps)
         return jax.tree.map(lambda x: factor * x, updates), state
 
@@ -124,10 +126,13 @@ def shrink_std(
     """
 
     def update(updates, state, params=None, **rollout: Any):
+        """Adds to the change of the log standard deviations what the schedule is ahead."""
         del params
-        now = jnp.floor(share(rollout["clock"], env_steps) * _STEPS) / _STEPS
-        change = (now - state.share) * jnp.log(ratio)
-        return updates | {"constants": updates["constants"] + change}, Shrunk(now)
+        # Optax adds updates to parameters, so the log of the std moves by the difference between
+        # what is due and what was made so far; learning's own changes of it stay.
+        due_share = jnp.floor(share(rollout["clock"], env_steps) * _STEPS) / _STEPS
+        change = (due_share - state.share) * jnp.log(ratio)
+        return updates | {"constants": updates["constants"] + change}, Shrunk(due_share)
 
     def init(params):
         del params

@@ -54,8 +54,10 @@ class Problem(NamedTuple):
     clock: Clock
 
 
-#: The gradient's noise is measured on one of so many episodes, and on so many at most.
-_NOISE_SHARE, _NOISE_EPISODES = 32, 64
+#: The gradient's noise is measured on one of so many episodes ...
+_NOISE_SHARE = 32
+#: ... and on so many at most.
+_NOISE_EPISODES = 64
 
 #: (problem, key, params, opt_state) -> (params, opt_state, metrics); may consume the key. The
 #: metrics are ``entropy``, the mean over samples; ``gradient_norm``, the mean over optimizer steps;
@@ -88,17 +90,20 @@ def whole_rollout(turn: Turn) -> Update:
     """``full_batch``, in which ``turn`` makes another step of the gradient."""
 
     def update(problem, key, params, opt_state):
+        """Returns the parameters and the optimizer's state after one step, and its metrics."""
         mask = problem.samples[-1]
+        # Of the sum over all samples; ``descend`` divides it, by N or by the steps.
         _, grads, sums = accumulate_gradient(problem.surrogate, params, problem.samples)
         metrics = {}
+        # One episode has no variance to be measured.
         if mask.shape[1] > 1:
             metrics["gradient_snr"] = _signal_to_noise(problem, params, grads)
         metrics["entropy"] = sums["entropy"] / jnp.maximum(jnp.sum(mask), 1)
-        own_turn = functools.partial(turn, problem, key, params)
-        params, opt_state, step = descend(
-            problem, grads, problem.divisor, params, opt_state, own_turn
+        turn_gradient = functools.partial(turn, problem, key, params)
+        params, opt_state, step_metrics = descend(
+            problem, grads, problem.divisor, params, opt_state, turn_gradient
         )
-        return params, opt_state, metrics | step
+        return params, opt_state, metrics | step_metrics
 
     return update
 
@@ -106,15 +111,17 @@ def whole_rollout(turn: Turn) -> Update:
 def _signal_to_noise(problem: Problem, params: Params, grads: Params) -> jax.Array:
     """Returns the signal-to-noise ratio [] of the gradients summed over all episodes."""
     num_episodes = problem.samples[-1].shape[1]
-    few = num_noise_episodes(num_episodes)
+    num_measured = num_noise_episodes(num_episodes)
 
-    def alone(episode):
+    def episode_gradient(episode):
+        # As a rollout of one episode: the axis [N] is back, with N = 1.
         samples = jax.tree.map(lambda x: x[:, None], episode)
         return accumulate_gradient(problem.surrogate, params, samples)[1]
 
-    each = jax.vmap(alone, in_axes=1)(jax.tree.map(lambda x: x[:, :few], problem.samples))
+    measured_samples = jax.tree.map(lambda x: x[:, :num_measured], problem.samples)
+    episode_gradients = jax.vmap(episode_gradient, in_axes=1)(measured_samples)
     mean = jax.tree.map(lambda g: g / num_episodes, grads)
-    return signal_to_noise(mean, each, num_episodes)
+    return signal_to_noise(mean, episode_gradients, num_episodes)
 
 
 def num_noise_episodes(num_episodes: int) -> int:
@@ -135,7 +142,9 @@ def descend(
     The optimizer is given what ``turn`` makes of the mean gradient.
     """
     grads = jax.tree.map(lambda g: g / divisor, grads)
+    # Of the gradient itself, before ``turn`` and the optimizer's clipping.
     norm = optax.tree.norm(grads)
+    # Schedules read the clock; other optimizers of optax would not take it.
     optimizer = optax.with_extra_args_support(problem.optimizer)
     changes, opt_state = optimizer.update(turn(grads), opt_state, params, clock=problem.clock)
     metrics = {"gradient_norm": norm}
@@ -174,15 +183,17 @@ def make_optimizer(
     if not callable(learning_rate):
         check_number("learning_rate", learning_rate)
     check_number("momentum", momentum)
+    # Adam's other constants, b2 = 0.999 and eps = 1e-8, are the same in PyTorch.
     optimizers = {"adam": optax.adam(learning_rate, momentum), "sgd": optax.sgd(learning_rate)}
     check_name("optimizer", name, optimizers)
     if max_grad_norm is None:
         return optimizers[name]
     check_number("max_grad_norm", max_grad_norm, positive=True, finite=False)
+    # Before the optimizer, as in PyTorch, so that one large gradient does not fill Adam's moments.
     return optax.chain(optax.clip_by_global_norm(max_grad_norm), optimizers[name])
 
 
-def signal_to_noise(mean: Params, each: Params, num_episodes: int) -> jax.Array:
+def signal_to_noise(mean: Params, episode_gradients: Params, num_episodes: int) -> jax.Array:
     """Returns an estimate [] of |E g|^2 / tr Cov(g), where g is the mean of N episodes' gradients.
 
     It is |g|^2 / noise - 1, and the noise is (1 / M) sum_m |g_m - g|^2 / (N - 1): unbiased for
@@ -197,11 +208,13 @@ def signal_to_noise(mean: Params, each: Params, num_episodes: int) -> jax.Array:
 
     Args:
       mean: g, a pytree.
-      each: g_m of M of the N episodes, the same with a leading axis [M].
+      episode_gradients: g_m of M of the N episodes, the same with a leading axis [M].
       num_episodes: N, at least 2.
     """
-    apart = jax.tree.map(lambda one, g: one - g, each, mean)
-    squares = jax.vmap(lambda tree: optax.tree.norm(tree, squared=True))(apart)
+    deviations = jax.tree.map(lambda g_m, g: g_m - g, episode_gradients, mean)
+    squares = jax.vmap(lambda tree: optax.tree.norm(tree, squared=True))(deviations)
+    # The variance of the mean of N: that of one episode is N / (N - 1) times its mean square
+    # deviation from the mean of N, and the mean's is 1 / N of it.
     noise = jnp.mean(squares) / (num_episodes - 1)
     return optax.tree.norm(mean, squared=True) / noise - 1
 
@@ -220,6 +233,7 @@ def accumulate_gradient(
     Returns:
       The loss [] (without it XLA rounds the rest otherwise), its gradient, the metrics: all summed.
     """
+    # Chunk by chunk, as the activations of all T * N samples need not fit into memory at once.
     differentiate = jax.value_and_grad(loss, has_aux=True)
 
     def visit(chunk):
@@ -236,15 +250,16 @@ def accumulate(function: Callable[[Any], Any], data: tuple[Any, ...]) -> Any:
       function: chunk of data -> a pytree of sums over the chunk, of zeros where its mask is empty.
       data: as for ``accumulate_gradient``.
     """
-    chunks, needed = in_chunks(data)
-    sums = jax.eval_shape(function, chunk_at(chunks, jnp.zeros((), jnp.int32)))
+    chunks, has_steps = in_chunks(data)
+    shapes = jax.eval_shape(function, chunk_at(chunks, jnp.zeros((), jnp.int32)))
 
     def body(carry):
+        # A seed that is done adds zeros: its mask is empty in the chunks that others still visit.
         index, sums = carry
         return index + 1, jax.tree.map(jnp.add, sums, function(chunk_at(chunks, index)))
 
-    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), sums)
-    return while_any(while_needed(needed), body, (jnp.zeros((), jnp.int32), zeros))[1]
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return while_any(while_needed(has_steps), body, (jnp.zeros((), jnp.int32), zeros))[1]
 
 
 def draw_steps(key: jax.Array, mask: jax.Array, shape: tuple[int, ...]) -> jax.Array:
@@ -259,14 +274,15 @@ def draw_steps(key: jax.Array, mask: jax.Array, shape: tuple[int, ...]) -> jax.A
       Indices int32 [*shape] into arrays [T * N, ...]; where there is no step, that of any.
     """
     ranks = jnp.cumsum(mask.reshape(-1))
-    drawn = jax.random.randint(key, shape, 1, 1 + jnp.maximum(ranks[-1], 1))
-    # Where the first, second, ... step inside the mask is; ``drawn`` counts from 1.
-    return jnp.searchsorted(ranks, drawn)
+    sampled_ranks = jax.random.randint(key, shape, 1, 1 + jnp.maximum(ranks[-1], 1))
+    # Where the first, second, ... step inside the mask is; ``sampled_ranks`` count from 1.
+    return jnp.searchsorted(ranks, sampled_ranks)
 
 
 def in_chunks(data: tuple[Any, ...]) -> tuple[tuple[Any, ...], jax.Array]:
     """Returns the data [C, length, N, ...], and which of the C chunks have a step to visit."""
     horizon, num_episodes = data[-1].shape
+    # It divides T, so that all chunks have one shape, as a loop needs it.
     length = chunk_length(horizon, num_episodes)
     chunks = jax.tree.map(lambda x: x.reshape(horizon // length, length, *x.shape[1:]), data)
     return chunks, jnp.any(chunks[-1], axis=(1, 2))
@@ -283,11 +299,16 @@ def chunk_at(chunks: tuple[Any, ...], index: jax.Array) -> tuple[Any, ...]:
     return jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, index, keepdims=False), chunks)
 
 
-def while_needed(needed: jax.Array) -> Callable[[Any], jax.Array]:
-    """Returns the condition of a loop over what is needed [C]; its carry begins with an index."""
+def while_needed(has_steps: jax.Array) -> Callable[[Any], jax.Array]:
+    """Returns the condition of a loop over chunks [C]; its carry begins with an index.
 
-    def more(carry):
+    Args:
+      has_steps: [C] whether any step of a chunk was played.
+    """
+
+    def has_next(carry):
+        # Where one chunk is empty, so are all after it: no step follows an episode's end.
         index = carry[0]
-        return (index < needed.size) & needed[jnp.minimum(index, needed.size - 1)]
+        return (index < has_steps.size) & has_steps[jnp.minimum(index, has_steps.size - 1)]
 
-    return more
+    return has_next

@@ -87,26 +87,32 @@ def value_baseline(
     to_go, network, fitter = _defaults(discount, network, optimizer)
 
     def value(params, observation, time):
-        share = jnp.asarray(time, observation.dtype) / horizon
-        seen = jnp.concatenate([observation, share[..., None]], axis=-1)
-        return jnp.asarray(network.apply(params, seen))[..., 0]
+        time_share = jnp.asarray(time, observation.dtype) / horizon
+        inputs = jnp.concatenate([observation, time_share[..., None]], axis=-1)
+        return jnp.asarray(network.apply(params, inputs))[..., 0]
 
     def init(key, observation_size):
-        network_key, key = jax.random.split(key)
-        seed = jax.random.bits(key, (), jnp.uint32)
+        network_key, seed_key = jax.random.split(key)
+        # ``update`` gets no key, so what its minibatches are drawn from is in the state.
+        seed = jax.random.bits(seed_key, (), jnp.uint32)
         params = _first_params(network, network_key, observation_size + 1)
         zero = jnp.zeros(())
         return Critic(params, fitter.init(params), seed, jnp.zeros((), jnp.int32), zero, zero)
 
     def update(critic, trajectory):
-        mask, num_episodes = trajectory.mask, trajectory.mask.shape[1]
+        """Returns G - V [T, N] with V as it was, the critic fitted to G, and how good V was."""
+        mask = trajectory.mask
+        num_episodes = mask.shape[1]
         returns = to_go.update((), trajectory)[0]
+        # V of every step, before the fit: the weight must not depend on its own episode through V.
         time = jnp.broadcast_to(jnp.arange(len(mask))[:, None], mask.shape)
         data = (trajectory.observation, time, mask)
         scaled = _map_steps(lambda chunk: value(critic.params, *chunk[:2]), data)
         values = critic.mean + jnp.sqrt(critic.variance) * scaled
         weight, metrics = _residual(returns, values, mask)
 
+        # The targets of the fit: G in standard deviations from its mean, this rollout's included.
+        # Flat, [T * N, ...]: step t of episode n has the index t * N + n.
         updates, mean, variance = _moments(critic, returns, mask)
         unit = jnp.where(variance > 0, jnp.sqrt(variance), 1.0)
         draw_key = jax.random.fold_in(jax.random.key(critic.seed), critic.updates)
@@ -114,6 +120,7 @@ def value_baseline(
         targets = (returns.reshape(-1) - mean) / unit
 
         def fit(carry, index):
+            """One optimizer step on the mean squared error over a minibatch ``index`` [batch]."""
             params, opt_state = carry
 
             def squared_error(params):
@@ -180,7 +187,10 @@ def full_batch_value_baseline(
         return FullBatchCritic(params, fitter.init(params))
 
     def update(critic, trajectory):
-        returns, mask = to_go.update((), trajectory)[0], trajectory.mask
+        """Returns G - V [T, N] with V as it was, the critic fitted to G, and how good V was."""
+        returns = to_go.update((), trajectory)[0]
+        mask = trajectory.mask
+        # V before the fit: the weight must not depend on its own episode through V.
         values = value(critic.params, trajectory.observation)
         weight, metrics = _residual(returns, values, mask)
         steps = jnp.maximum(jnp.sum(mask), 1)
@@ -204,8 +214,11 @@ def _defaults(
     optimizer: optax.GradientTransformation | None,
 ) -> tuple[Estimator, nn.Module, optax.GradientTransformation]:
     """Returns what gives the returns to go, the network, and the optimizer."""
-    network = MLP((64, 64), 1) if network is None else network
-    return reward_to_go(discount), network, optax.adam(3e-3) if optimizer is None else optimizer
+    if network is None:
+        network = MLP((64, 64), 1)
+    if optimizer is None:
+        optimizer = optax.adam(3e-3)
+    return reward_to_go(discount), network, optimizer
 
 
 def _first_params(network: nn.Module, key: jax.Array, inputs: int) -> Any:
@@ -236,17 +249,18 @@ def _map_steps(function: Callable[[Any], jax.Array], data: tuple[Any, ...]) -> j
       function: data [..., *] of any steps -> a number for each, [...].
       data: as for ``accumulate_gradient``.
     """
-    chunks, needed = in_chunks(data)
+    chunks, has_steps = in_chunks(data)
 
     def body(carry):
         index, values = carry
         chunk = chunk_at(chunks, index)
-        own = jnp.where(chunk[-1], function(chunk), 0.0)
-        return index + 1, lax.dynamic_update_index_in_dim(values, own, index, 0)
+        chunk_values = jnp.where(chunk[-1], function(chunk), 0.0)
+        return index + 1, lax.dynamic_update_index_in_dim(values, chunk_values, index, 0)
 
-    one = jax.eval_shape(function, chunk_at(chunks, jnp.zeros((), jnp.int32)))
-    zeros = jnp.zeros((needed.size, *one.shape), one.dtype)
-    values = while_any(while_needed(needed), body, (jnp.zeros((), jnp.int32), zeros))[1]
+    # Chunks without a step are not visited; their values stay 0.
+    shapes = jax.eval_shape(function, chunk_at(chunks, jnp.zeros((), jnp.int32)))
+    zeros = jnp.zeros((has_steps.size, *shapes.shape), shapes.dtype)
+    values = while_any(while_needed(has_steps), body, (jnp.zeros((), jnp.int32), zeros))[1]
     return values.reshape(data[-1].shape)
 
 
@@ -259,12 +273,14 @@ def _moments(
     """
     steps = jnp.sum(mask)
     updates = critic.updates + (steps > 0)
-    counted = jnp.maximum(updates.astype(jnp.uint32), 1)  # beyond 2^31 an int32 is negative
-    share = jnp.where(steps > 0, jnp.maximum(1 / counted, _UPDATE_SHARE), 0.0)
+    divisor = jnp.maximum(updates.astype(jnp.uint32), 1)  # beyond 2^31 an int32 is negative
+    # 1/k in update k is the plain mean of k updates; from the tenth on, a running mean.
+    share = jnp.where(steps > 0, jnp.maximum(1 / divisor, _UPDATE_SHARE), 0.0)
 
     def mean(x):
         return jnp.sum(jnp.where(mask, x, 0.0)) / jnp.maximum(steps, 1)
 
     center = critic.mean + share * (mean(returns) - critic.mean)
+    # About the running mean, not this rollout's, from which the values are measured.
     spread = mean((returns - center) ** 2)
     return updates, center, critic.variance + share * (spread - critic.variance)

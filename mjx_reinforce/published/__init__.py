@@ -1,1 +1,1 @@
-"""Learners: from episodes to better parameters."""
+"""Programs of published documents, with what is wrong in them, and augmented random search."""

@@ -98,7 +98,8 @@ def ars(
     check_number("noise_std", noise_std, positive=True)
     check_number("normalize_steps", normalize_steps, finite=False)
     check_number("normalize_min_std", normalize_min_std)
-    policy = _zero_policy(env) if policy is None else policy
+    if policy is None:
+        policy = _zero_policy(env)
     contract.check_policy(policy, env, base.observation_size(env))
     search = _Search(
         env=env,
@@ -108,11 +109,13 @@ def ars(
         noise_std=noise_std,
         increment=mean_difference if increment is None else increment,
         horizon=contract.check_horizon(env, horizon),
-        normalize_limits=(normalize_steps, normalize_min_std),
+        normalize_steps=normalize_steps,
+        normalize_min_std=normalize_min_std,
         engine=choose(engine, env),
     )
-    played = within_bounds(policy, base.action_space(env))
-    return mr.Learner(search.init, search.play, search.learn, played, search.engine)
+    # The search plays what the policy puts out; whoever plays the learner's policy stays in bounds.
+    clipped_policy = within_bounds(policy, base.action_space(env))
+    return mr.Learner(search.init, search.play, search.learn, clipped_policy, search.engine)
 
 
 def make(env: mr.Environment, config: Any, **shared: Any) -> mr.Learner:
@@ -138,7 +141,8 @@ class _Search:
     noise_std: float | jax.Array
     increment: Increment
     horizon: int
-    normalize_limits: tuple[float, float | jax.Array]
+    normalize_steps: float
+    normalize_min_std: float | jax.Array
     engine: Engine
 
     def init(self, key: jax.Array) -> mr.TrainState:
@@ -151,14 +155,17 @@ class _Search:
     def play(self, state: mr.TrainState, key: jax.Array, active: bool | jax.Array = True) -> Trial:
         """``Learner.play``: draws the directions, and plays an episode each way along each."""
         directions_key, episodes_key = jax.random.split(key)
-        many = jax.tree.map(
+        # theta once for each direction, [D, ...], and a standard normal delta of that shape.
+        copies = jax.tree.map(
             lambda p: jnp.broadcast_to(p, (self.num_directions, *p.shape)), state.actor.params
         )
-        directions = optax.tree.random_like(directions_key, many)
+        directions = optax.tree.random_like(directions_key, copies)
+        # theta + nu delta and theta - nu delta, [2, D, ...].
         moves = jax.tree.map(lambda d: self.noise_std * d, directions)
-        tried = jax.tree.map(lambda p, d: jnp.stack([p + d, p - d]), many, moves)
+        params_both_ways = jax.tree.map(lambda p, d: jnp.stack([p + d, p - d]), copies, moves)
 
-        def one_way(params: Any, key: jax.Array) -> mr.Trajectory:
+        def play_one_way(params: Any, key: jax.Array) -> mr.Trajectory:
+            """Returns [T, D] of D policies, an episode each, by their modes."""
             return self.engine.rollout(
                 self.env,
                 self._act_each,
@@ -171,49 +178,60 @@ class _Search:
                 active=active,
             )
 
-        return Trial(directions, _join(jax.vmap(one_way)(tried, jax.random.split(episodes_key))))
+        # The two ways have keys of their own, so that their episodes start apart.
+        keys = jax.random.split(episodes_key)
+        return Trial(directions, _join(jax.vmap(play_one_way)(params_both_ways, keys)))
 
     def _act_each(self, actor: mr.Actor, observation: jax.Array) -> jax.Array:
         """Returns the outputs [D, K] of D policies for an observation [D, O] of each."""
-        own_params = actor.replace(params=0, normalizer=None)
-        return jax.vmap(functools.partial(mr.act, self.policy), (own_params, 0))(actor, observation)
+        # Each policy has its own params, axis 0; all share one normalizer.
+        axes = actor.replace(params=0, normalizer=None)
+        return jax.vmap(functools.partial(mr.act, self.policy), (axes, 0))(actor, observation)
 
     def learn(
         self, state: mr.TrainState, trial: Trial, key: jax.Array
     ) -> tuple[mr.TrainState, Metrics]:
         """``Learner.learn``: the module's formula."""
         del key
-        actor, played = state.actor, trial.trajectory
-        returns = replace_broken(episode_returns(played), played.nonfinite).reshape(2, -1)
+        actor = state.actor
+        trajectory = trial.trajectory
+        # r_plus and r_minus, [2, D].
+        returns = replace_broken(episode_returns(trajectory), trajectory.nonfinite).reshape(2, -1)
         step = self.increment(trial.directions, returns, self.noise_std)
         params = jax.tree.map(lambda p, d: p + self.step_size * d, actor.params, step)
-        counted = played.mask & ~played.nonfinite
+        # V2 of the paper counts the states that all policies met, for the next update.
+        sound_steps = trajectory.mask & ~trajectory.nonfinite
         normalizer = normalize.update(
-            actor.normalizer, played.observation, counted, *self.normalize_limits
+            actor.normalizer,
+            trajectory.observation,
+            sound_steps,
+            at_most=self.normalize_steps,
+            min_std=self.normalize_min_std,
         )
         after = state.replace(actor=mr.Actor(params=params, normalizer=normalizer))
         after, skipped = keep_finite(after, state)
-        measured = {
+        measurements = {
             "entropy": jnp.zeros(()),
             "gradient_norm": optax.tree.norm(step),
             "return_std": jnp.std(returns),
         }
-        return after, update_metrics(played, skipped, measured)
+        return after, update_metrics(trajectory, skipped, measurements)
 
 
-def _join(played: mr.Trajectory) -> mr.Trajectory:
+def _join(trajectory: mr.Trajectory) -> mr.Trajectory:
     """Returns [T, 2 D, ...] from two rollouts stacked [2, T, D, ...]."""
 
     def join(x: jax.Array) -> jax.Array:
         return jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])
 
-    return played.replace(
-        observation=join(played.observation),
-        action=join(played.action),
-        reward=join(played.reward),
-        mask=join(played.mask),
-        nonfinite=played.nonfinite.reshape(-1),
-        simulated=jnp.sum(played.simulated),
+    # ``nonfinite`` has no time axis, and ``simulated`` one number a rollout.
+    return trajectory.replace(
+        observation=join(trajectory.observation),
+        action=join(trajectory.action),
+        reward=join(trajectory.reward),
+        mask=join(trajectory.mask),
+        nonfinite=trajectory.nonfinite.reshape(-1),
+        simulated=jnp.sum(trajectory.simulated),
     )
 
 
@@ -228,6 +246,7 @@ def mean_difference(directions: Any, returns: jax.Array, noise_std: Any) -> Any:
 def over_std(x: jax.Array, returns: jax.Array) -> jax.Array:
     """Returns ``x`` over the standard deviation of all returns, 0 if they are all equal."""
     std = jnp.std(returns)
+    # 0 where all returns are equal, NaN where all episodes broke: the parameters then stay.
     return jnp.where(std > 0, x / jnp.where(std > 0, std, 1.0), 0.0)
 
 

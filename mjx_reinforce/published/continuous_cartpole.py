@@ -53,10 +53,16 @@ def random_search(env: mr.Environment, config: Any, **shared: Any) -> mr.Learner
             f"the document's policy is linear, got --hidden-sizes {config.hidden_sizes}"
         )
     policy = shared.pop("policy")
-    tied = policy._replace(apply=lambda params, seen: policy.apply(_overwrite_bias(params), seen))
-    search = corrected_search(env, config, policy=tied, increment=increment, **shared)
+
+    def apply(params: Any, observation: jax.Array) -> jax.Array:
+        return policy.apply(_overwrite_bias(params), observation)
+
+    tied_policy = policy._replace(apply=apply)
+    search = corrected_search(env, config, policy=tied_policy, increment=increment, **shared)
 
     def learn(state: mr.TrainState, trial: Any, key: jax.Array) -> Any:
+        # The bias that played is written into the params, so that ``policy``, which has its bias
+        # for itself, plays as the search did.
         state, metrics = search.learn(state, trial, key)
         params = _overwrite_bias(state.actor.params)
         return state.replace(actor=state.actor.replace(params=params)), metrics
@@ -77,9 +83,10 @@ def increment(directions: Any, returns: jax.Array, noise_std: Any) -> Any:
     divide by how many directions there are, and multiplies by ``noise_std``. Not reproduced: where
     all returns are equal it divides 0 by 0, and its parameters are NaN for good.
     """
+    # [D]: what each direction adds up to over all entries of all parameters.
     totals = sum(jnp.sum(d.reshape(len(d), -1), axis=1) for d in jax.tree.leaves(directions))
-    moved = noise_std * jnp.sum(over_std(returns[0] - returns[1], returns) * totals)
-    return jax.tree.map(lambda d: jnp.full(d.shape[1:], moved, d.dtype), directions)
+    step = noise_std * jnp.sum(over_std(returns[0] - returns[1], returns) * totals)
+    return jax.tree.map(lambda d: jnp.full(d.shape[1:], step, d.dtype), directions)
 
 
 def _overwrite_bias(params: Any) -> Any:

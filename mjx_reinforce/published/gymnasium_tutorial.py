@@ -49,13 +49,15 @@ def with_one_start(learner: mr.Learner) -> mr.Learner:
 
     def init(key: jax.Array) -> mr.TrainState:
         state = learner.init(key)
+        # Split from the seed's own key, so that seeds start apart.
         key, start_key = jax.random.split(state.key)
         return state.replace(key=key, start_key=start_key)
 
     def play(state: mr.TrainState, key: jax.Array, active: Any = True, rollout: Any = None) -> Any:
         def from_one_start(env: Any, *policy: Any, **options: Any) -> mr.Trajectory:
-            anywhere = learner.engine.rollout if rollout is None else rollout
-            return anywhere(_OneStart(env, state.start_key), *policy, **options)
+            # The start key is in the state, not in ``env``: each seed of a vmap has its own.
+            any_start = learner.engine.rollout if rollout is None else rollout
+            return any_start(_OneStart(env, state.start_key), *policy, **options)
 
         return learner.play(state, key, active, from_one_start)
 
@@ -66,7 +68,8 @@ class _OneStart:
     """An environment whose every episode starts with the same key."""
 
     def __init__(self, env: Any, key: Any):
-        self._env, self._key = env, key
+        self._env = env
+        self._key = key
 
     def reset(self, rng: jax.Array) -> Any:
         del rng

@@ -67,9 +67,11 @@ def normalized_returns(discount: float | jax.Array = 0.99) -> Estimator:
     check_discount(discount)
 
     def weigh(trajectory):
+        """Returns G[t, n] in standard deviations from the mean of its episode, [T, N]."""
         mask = trajectory.mask
         returns = discounted_returns(trajectory.reward, discount)
         centered = jnp.where(mask, returns - _episode_mean(returns, mask), 0.0)
+        # Over L - 1, as torch.std divides; an episode of one step is centered to 0 already.
         variance = jnp.sum(centered**2, axis=0) / jnp.maximum(jnp.sum(mask, axis=0) - 1, 1)
         normalized = centered / (jnp.sqrt(variance) + float(jnp.finfo(jnp.float32).eps))
         return replace_broken(normalized, trajectory.nonfinite)
@@ -104,19 +106,22 @@ def minibatches(num_updates: int, batch_size: int) -> Update:
         check_count(name, value)
 
     def update(problem, key, params, opt_state):
+        """Returns the parameters and the optimizer's state after all steps, and mean metrics."""
         mask = problem.samples[-1].reshape(-1)
-        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), problem.samples)
+        # Steps of all episodes in one row, [T * N, ...], of which each minibatch is a part.
+        samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), problem.samples)
         indices = draw_steps(key, mask, (num_updates, batch_size))
 
-        def one(carry, index):
+        def optimizer_step(carry, index):
+            """One step on the minibatch ``index`` [batch_size]."""
             params, opt_state = carry
-            batch = jax.tree.map(lambda x: x[index], flat)
+            batch = jax.tree.map(lambda x: x[index], samples)
             grads, sums = jax.grad(problem.surrogate, has_aux=True)(params, batch)
-            params, opt_state, step = descend(problem, grads, batch_size, params, opt_state)
-            return (params, opt_state), step | {"entropy": sums["entropy"] / batch_size}
+            params, opt_state, metrics = descend(problem, grads, batch_size, params, opt_state)
+            return (params, opt_state), metrics | {"entropy": sums["entropy"] / batch_size}
 
-        (params, opt_state), steps = lax.scan(one, (params, opt_state), indices)
-        return params, opt_state, {name: jnp.mean(x) for name, x in steps.items()}
+        (params, opt_state), metrics = lax.scan(optimizer_step, (params, opt_state), indices)
+        return params, opt_state, {name: jnp.mean(x) for name, x in metrics.items()}
 
     return update
 
@@ -139,29 +144,32 @@ def each_step() -> Update:
     """
 
     def update(problem, key, params, opt_state):
+        """Returns the parameters and the optimizer's state after all steps, and mean metrics."""
         del key
         mask = problem.samples[-1]
-        more = while_needed(jnp.any(mask, axis=1))
+        has_next = while_needed(jnp.any(mask, axis=1))
 
-        def one(t, params, opt_state):
-            now = jax.tree.map(
+        def optimizer_step(t, params, opt_state):
+            """One step on the terms of all episodes at t: samples [N, ...]."""
+            samples = jax.tree.map(
                 lambda x: lax.dynamic_index_in_dim(x, t, keepdims=False), problem.samples
             )
-            grads, sums = jax.grad(problem.surrogate, has_aux=True)(params, now)
-            params, opt_state, step = descend(problem, grads, problem.divisor, params, opt_state)
-            return params, opt_state, step | sums
+            grads, sums = jax.grad(problem.surrogate, has_aux=True)(params, samples)
+            params, opt_state, metrics = descend(problem, grads, problem.divisor, params, opt_state)
+            return params, opt_state, metrics | sums
 
         def body(carry):
             t, params, opt_state, sums = carry
-            moved, moved_state, measured = one(t, params, opt_state)
-            after = t + 1, moved, moved_state, jax.tree.map(jnp.add, sums, measured)
+            params, opt_state, metrics = optimizer_step(t, params, opt_state)
+            after = t + 1, params, opt_state, jax.tree.map(jnp.add, sums, metrics)
             # Vmapped over seeds, the loop goes on until the seed with the longest episode is done.
-            return jax.tree.map(lambda new, old: jnp.where(more(carry), new, old), after, carry)
+            return jax.tree.map(lambda new, old: jnp.where(has_next(carry), new, old), after, carry)
 
         start = jnp.zeros((), jnp.int32)
-        measured = jax.eval_shape(one, start, params, opt_state)[2]
-        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), measured)
-        t, params, opt_state, sums = while_any(more, body, (start, params, opt_state, zeros))
+        shapes = jax.eval_shape(optimizer_step, start, params, opt_state)[2]
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        t, params, opt_state, sums = while_any(has_next, body, (start, params, opt_state, zeros))
+        # The entropy is a sum over all steps of all episodes, the other metrics one number a step.
         entropy = sums.pop("entropy") / jnp.maximum(jnp.sum(mask), 1)
         means = {name: x / jnp.maximum(t, 1) for name, x in sums.items()}
         return params, opt_state, means | {"entropy": entropy}
@@ -175,11 +183,11 @@ def per_step(update: Update) -> Update:
     The gradient then does not grow with the episodes. (A minibatch always is a mean over steps.)
     """
 
-    def averaged(problem, key, params, opt_state):
+    def mean_update(problem, key, params, opt_state):
         steps = jnp.maximum(jnp.sum(problem.samples[-1]), 1)
         return update(problem._replace(divisor=steps), key, params, opt_state)
 
-    return averaged
+    return mean_update
 
 
 def deterministic(
@@ -199,6 +207,7 @@ def deterministic(
     del initial_std
     layout = gaussian_outputs("deterministic", space, "parameter", 1.0, rescale)
 
+    # There is no density to speak of: the error comes when a learner that needs one is built.
     def log_prob(outputs, action):
         raise ValueError(
             "a deterministic policy has no log-probability; choose a stochastic one for REINFORCE"

@@ -13,7 +13,7 @@ from scipy import stats
 from toys import Survive, Target, categorical
 
 from mjx_reinforce import Trajectory, mlp_policy, normal, reinforce
-from mjx_reinforce.learning import diagnostics, normalize, updates
+from mjx_reinforce.learning import diagnostics, normalize, trust_region, updates
 from mjx_reinforce.learning.policy import Actor
 
 
@@ -144,8 +144,8 @@ def test_a_change_without_a_kl_is_kept_as_it_is():
     policy = mlp_policy(1, normal(Survive.action_space), ())
     actor = Actor(params=policy.init(jax.random.key(0)), normalizer=normalize.init(1))
     visited = diagnostics.visited_steps(make_trajectory([4, 9], 20))
-    same = diagnostics.within_kl(policy, actor, actor, visited, 0.01)
+    same = trust_region.within_kl(policy, actor, actor, visited, 0.01)
     assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), same, actor))
     broken = actor.replace(params=jax.tree.map(lambda x: x * jnp.nan, actor.params))
-    kept = diagnostics.within_kl(policy, actor, broken, visited, 0.01).params
+    kept = trust_region.within_kl(policy, actor, broken, visited, 0.01).params
     assert all(np.isnan(x).all() for x in jax.tree.leaves(kept))  # for ``keep_finite`` to see

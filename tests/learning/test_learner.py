@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import inspect
 
 import jax
 import jax.flatten_util
@@ -37,6 +38,20 @@ def train(env, num_updates, **settings):
         return learner.step(state)
 
     return learner, *jax.jit(lambda s: jax.lax.scan(body, s, length=num_updates))(state)
+
+
+def test_train_step_has_what_a_jitted_function_has():
+    learner, init = survivor()
+    state = jax.eval_shape(init, jax.random.key(0))
+    after, metrics = train_step.eval_shape(learner, state)
+    assert jax.tree.structure(after) == jax.tree.structure(state)
+    assert metrics["episodes"].shape == ()
+    lowered = train_step.lower(learner, state)
+    assert lowered.out_info[1].keys() == metrics.keys()
+    assert train_step.trace(learner, state).jaxpr.out_avals
+    assert list(inspect.signature(train_step).parameters) == ["learner", "state"]
+    with pytest.raises(ValueError, match="state must be of type TrainState"):
+        train_step(learner, metrics)
 
 
 @pytest.mark.slow
