@@ -9,7 +9,7 @@ from typing import Any
 
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.runs.display import Display, SweepScreen
-from mjx_reinforce.runs.plan import Part, Prepared
+from mjx_reinforce.runs.plan import GroupPlan, Prepared
 from mjx_reinforce.runs.saving import Files
 from mjx_reinforce.setup.compile_times import keep_seconds
 from mjx_reinforce.training.driver import Driver, Observer, Runs, Training, begin_run
@@ -28,7 +28,7 @@ def conduct(
 
     Args:
       prepared: what a run or a sweep is made of.
-      files: of it, if it has any.
+      files: of it. A sweep always has some; a run has None if it is to leave nothing.
       display: its screen.
       observers: who sees it, besides these.
       interrupt: what listens to signals.
@@ -39,68 +39,84 @@ def conduct(
     Raises:
       OSError: the first or the last files cannot be written.
     """
-    written = [] if files is None else [files]
-    left = [
-        part._replace(chunks=[x for x in part.chunks if not any(f.has(x.name) for f in written)])
-        for part in prepared.parts
-    ]
-    screen = display if prepared.alone else SweepScreen(display, prepared, left)
-    everyone, clock = [*written, screen, *observers], prepared.clock
-    chunks = _compiled([part for part in left if part.chunks], clock)
-    chunks = itertools.chain([*itertools.islice(chunks, 1)], chunks)  # compiles the first
+    # No loop below runs for the files of a run that leaves none.
+    own_files = [] if files is None else [files]
+    unfinished_groups = []
+    for plan in prepared.plans:
+        chunks = [x for x in plan.chunks if not any(file.has(x.name) for file in own_files)]
+        if chunks:
+            unfinished_groups.append(plan._replace(chunks=chunks))
+    screen = display
+    if not prepared.alone:
+        screen = SweepScreen(display, prepared, unfinished_groups)
+    # The files are first: an error of theirs ends the run before a user's function sees an
+    # evaluation that is nowhere on the disk.
+    all_observers = [*own_files, screen, *observers]
+    clock = prepared.clock
+    # A generator compiles when it is first asked. The first chunk is taken from it here, so that
+    # all compiling that nothing runs beside is before the clock is read.
+    compiled_chunks = _compiled(unfinished_groups, clock)
+    compiled_chunks = itertools.chain([*itertools.islice(compiled_chunks, 1)], compiled_chunks)
     clock.compiling = time.perf_counter() - clock.began
     # Where others compute beside this, what it computed itself is nearer to a quiet machine's time.
-    quiet = min(clock.compiling, time.process_time() - clock.computed)
-    if any(part.chunks for part in left):
-        keep_seconds(prepared.design.configs[0], prepared.design.over, quiet)
+    quiet_seconds = min(clock.compiling, time.process_time() - clock.computed)
+    if unfinished_groups:
+        keep_seconds(prepared.design.configs[0], prepared.design.over, quiet_seconds)
     # Not before: a kill while it compiles leaves nothing that would refuse the next.
     interrupt.defer(display.say)
-    for each in written:
-        each.open()
+    for file in own_files:
+        file.open()
     display.start(clock.compiling)
     driver = None
-    for part, runs, compiled in chunks:
-        config = dataclasses.replace(part.group.config, num_seeds=len(runs.seed))
-        settings = {name: values[runs.place] for name, values in part.group.settings.items()}
+    for plan, runs, compiled in compiled_chunks:
+        # The number of seeds is here that of the chunk's runs, whatever configuration each is of.
+        config = dataclasses.replace(plan.group.config, num_seeds=len(runs.seed))
+        settings = {name: values[runs.place] for name, values in plan.group.settings.items()}
         slots = Slots(compiled, runs.seed, settings)
         if prepared.alone:
-            given = config, part.ready.threshold, slots, runs, prepared.found, prepared.actors
-            driver = begin_run(*given, display.say, everyone, interrupt.heard)
+            given = config, plan.ready.threshold, slots, runs, prepared.checkpoint, prepared.actors
+            driver = begin_run(*given, display.say, all_observers, interrupt.heard)
         else:
-            driver = Training(config, slots, Record(config), runs, everyone)
-        for observer in everyone:
+            driver = Training(config, slots, Record(config), runs, all_observers)
+        for observer in all_observers:
             observer.began(driver)
         driver.drive(interrupt.heard)
-        for observer in everyone:
+        for observer in all_observers:
             observer.ended(driver)
+        # A chunk that is not done was interrupted, and so is what would follow it.
         if not driver.record.done():
             break
     if isinstance(driver, Driver):
         # A signal after that changes nothing: what is left takes a second or two.
-        test, engine = driver.test(interrupt.heard), prepared.parts[0].ready.engine
-        summary = driver.summary(engine, clock.compiling, test)
+        test = driver.test(interrupt.heard)
+        summary = driver.summary(prepared.plans[0].ready.engine, clock.compiling, test)
     else:
         assert files is not None
-        ended = driver is None or driver.record.done()
-        summary = dict(files.contents, status="finished" if ended else "interrupted")
+        is_done = driver is None or driver.record.done()
+        summary = dict(files.contents, status="finished" if is_done else "interrupted")
+        # A sweep that was resumed has spent time before, which its sweep.json says.
         summary["compile_seconds"] += clock.compiling
         summary["run_seconds"] += clock.running()
-    for observer in everyone:
+    for observer in all_observers:
         observer.finished(driver, summary)
     return driver, summary
 
 
-def _compiled(parts: Sequence[Part], clock: Stopwatch) -> Iterator[tuple[Part, Runs, Compiled]]:
+def _compiled(
+    plans: Sequence[GroupPlan], clock: Stopwatch
+) -> Iterator[tuple[GroupPlan, Runs, Compiled]]:
     """Yields chunks with the programs of their group; those of the next compile meanwhile."""
-    waiting = [functools.partial(_compile, part) for part in parts[:1]]
-    for number, part in enumerate(parts, start=1):
-        compiled = clock.wait(waiting.pop())
-        following = [functools.partial(_compile, later) for later in parts[number : number + 1]]
-        waiting = [started(task).result for task in following]
-        for runs in part.chunks:
-            yield part, runs, compiled
+    # A list with the task of the group that is next, or with none behind the last one.
+    tasks = [functools.partial(_compile, plan) for plan in plans[:1]]
+    for number, plan in enumerate(plans, start=1):
+        compiled = clock.wait(tasks.pop())
+        # One group ahead, and not all: compiling takes memory and cores from what trains.
+        following = [functools.partial(_compile, later) for later in plans[number : number + 1]]
+        tasks = [started(task).result for task in following]
+        for runs in plan.chunks:
+            yield plan, runs, compiled
 
 
-def _compile(part: Part) -> Compiled:
+def _compile(plan: GroupPlan) -> Compiled:
     """Returns the programs of a group."""
-    return compile_slots(part.ready.programs(), part.group.config, part.width)
+    return compile_slots(plan.ready.programs(), plan.group.config, plan.width)

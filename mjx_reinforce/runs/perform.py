@@ -40,6 +40,7 @@ _ROOM = 2**20
 
 def _make(directory: Path) -> None:
     """Makes the directory of a run, or raises OSError; ValueError if it is in that of another."""
+    # Removing the outer run would remove this one, too.
     if (outer := _run_around(directory)) is not None:
         raise ValueError(
             f"the run directory {directory} would be inside the run {outer}; choose another "
@@ -61,9 +62,11 @@ def _check_unbegun(directory: Path) -> None:
 
 def _run_around(directory: Path) -> Path | None:
     """Returns the run or sweep that a directory is in, if any."""
+    # The real path: a symbolic link may lead into a run.
     for parent in Path(os.path.realpath(directory)).parents:
-        run = (parent / "config.json").exists() and (parent / "metrics.csv").exists()
-        if run or (parent / "sweep.json").exists():
+        # Other programs have a config.json, too; a run of this one has both.
+        is_run = (parent / "config.json").exists() and (parent / "metrics.csv").exists()
+        if is_run or (parent / "sweep.json").exists():
             return parent
     return None
 
@@ -101,30 +104,37 @@ def own_directory(
       ValueError: it is not empty, is in that of another run, cannot be written, or is another
         process's.
     """
-    made: list[Path] = []
-    with contextlib.ExitStack() as held:
+    new_folders: list[Path] = []
+    with contextlib.ExitStack() as stack:
         try:
-            made = [folder for folder in (directory, *directory.parents) if not folder.exists()]
+            # The innermost comes first, as ``remove_empty`` needs it.
+            candidates = (directory, *directory.parents)
+            new_folders = [folder for folder in candidates if not folder.exists()]
             if not resumed:
                 _make(directory)
             _try_to_write(directory)
-            held.enter_context(locked(directory))  # a folder in which another trains stays
+            # Before anything is removed below: a folder in which another process trains stays.
+            stack.enter_context(locked(directory))
+            # Under the lock: another process may have begun here a moment ago.
             if not resumed:
-                _check_unbegun(directory)  # not before: another may have been quicker
+                _check_unbegun(directory)
             place = directory.stat()
         except OSError as error:
-            remove_empty(made)
-            full = error.errno in _FULL
-            remedy = "make room there" if full else "make it a folder that you may write to"
-            remedy += "" if resumed else ", or choose another --output"
+            remove_empty(new_folders)
+            remedy = "make it a folder that you may write to"
+            if error.errno in _FULL:
+                remedy = "make room there"
+            if not resumed:
+                remedy += ", or choose another --output"
             raise ValueError(
                 f"cannot write to the run directory {directory} ({error.strerror}); {remedy}"
             ) from error
-        interrupt.on_exit(lambda: remove_empty(made))
+        # A signal that ends the process runs no ``finally``.
+        interrupt.on_exit(lambda: remove_empty(new_folders))
         try:
             yield place
         finally:
-            remove_empty(made)
+            remove_empty(new_folders)
 
 
 @contextlib.contextmanager
@@ -134,6 +144,7 @@ def locked(directory: Path) -> Iterator[None]:
     Raises:
       ValueError: another one does.
     """
+    # On the folder itself, so that no lock file is among those of the run.
     descriptor = os.open(directory, os.O_RDONLY)
     try:
         try:
@@ -188,17 +199,24 @@ def perform(
       OSError: the first or the last files cannot be written.
     """
     check_design(design)
-    with contextlib.ExitStack() as held:
-        directory, resumed = design.directory if files else None, design.base.resume is not None
+    with contextlib.ExitStack() as stack:
+        directory = None
         place = None
-        if directory is not None:
-            place = held.enter_context(own_directory(directory, interrupt, resumed=resumed))
-        known = read_record(design.directory) if resumed else {}
-        if known.get("status") == "finished":  # of a sweep
-            return Outcome(directory, known, None, {}, _display(quiet=quiet))
+        resumed = design.base.resume is not None
+        if files:
+            directory = design.directory
+            place = stack.enter_context(own_directory(directory, interrupt, resumed=resumed))
+        # Under the lock: the process that trains there would change it.
+        saved_record = read_record(design.directory) if resumed else {}
+        # Only sweep.json has a status: a finished run goes on with a larger budget.
+        if saved_record.get("status") == "finished":
+            return Outcome(directory, saved_record, None, {}, _display(quiet=quiet))
         # A module of the user's is imported before JAX starts, which it may set up.
         first = design.configs[0]
-        env = None if envs.is_ours(first.env) else envs.make_set(first.env, first.env_set)
+        env = None
+        if not envs.is_ours(first.env):
+            env = envs.make_set(first.env, first.env_set)
+        # These imports load JAX and MJX, for seconds: bad input was refused before.
         try:
             configure_jax()
             from mjx_reinforce.envs.instability import instability
@@ -214,17 +232,18 @@ def perform(
         if (model := getattr(env, "mj_model", None)) is not None:
             display.warn_of_model(instability(model))
         with display.console.status("writing the simulation out"):
-            prepared = prepare(design, known, env, display.say)
+            prepared = prepare(design, saved_record, env, display.say)
         display.say(describe(prepared))
         display.say(describe_compiling(first, design.over))
         with display:
-            kind = SweepFiles if design.over else RunFiles
-            written = None
+            own_files = None
             if directory is not None and place is not None:
-                check_place(directory, place)  # writing the simulation out took its time
-                written = kind(directory, prepared, display.say)
-            driver, summary = conduct(prepared, written, display, observers, interrupt)
-        return Outcome(directory, summary, driver, prepared.parts[0].ready.policy, display)
+                # Writing the simulation out took its time, in which it may have been moved.
+                check_place(directory, place)
+                kind = SweepFiles if design.over else RunFiles
+                own_files = kind(directory, prepared, display.say)
+            driver, summary = conduct(prepared, own_files, display, observers, interrupt)
+        return Outcome(directory, summary, driver, prepared.plans[0].ready.policy, display)
 
 
 def _display(*, quiet: bool) -> "Display":

@@ -133,20 +133,20 @@ def prepared(base=BASE, known=MappingProxyType({}), **changes):
 
 def test_a_group_is_what_shares_its_programs():
     sweep = prepared()
-    groups = [part.group for part in sweep.parts]
+    groups = [plan.group for plan in sweep.plans]
     assert [group.members.tolist() for group in groups] == [[0, 1, 2], [3, 4, 5]]
     assert [group.config.num_episodes for group in groups] == [2, 4]
     assert groups[1].settings["learning_rate"].tolist() == [1e-3, 1e-2, 1e-1]
-    assert [part.ready.horizon for part in sweep.parts] == [50, 50]
+    assert [plan.ready.horizon for plan in sweep.plans] == [50, 50]
     assert describe(sweep).startswith("Training 6 configurations of 3 seeds of Cont")
 
 
 def test_a_chunk_has_as_many_runs_as_asked_or_as_it_had(monkeypatch, tmp_path):
-    assert [part.limit for part in prepared(chunk_runs=4).parts] == [4, 4]
+    assert [plan.limit for plan in prepared(chunk_runs=4).plans] == [4, 4]
     known = {"chunk_runs": [2, 9], "local_devices": 1}
     monkeypatch.setattr(plan.resume, "check_same_program", lambda *given: None)
     base = dataclasses.replace(BASE, resume=tmp_path)
-    assert [part.limit for part in prepared(base, known, chunk_runs=4).parts] == [2, 9]
+    assert [plan.limit for plan in prepared(base, known, chunk_runs=4).plans] == [2, 9]
     known["local_devices"] = 3
     with pytest.raises(ValueError, match="was begun on 3 devices, and here are 1"):
         prepared(base, known)
@@ -155,7 +155,7 @@ def test_a_chunk_has_as_many_runs_as_asked_or_as_it_had(monkeypatch, tmp_path):
 def test_exact_sweeps_have_one_device_and_trace_every_number():
     sweep = prepared(exact=True)
     assert sweep.division.count == 1
-    assert len(sweep.parts[0].group.settings) > 5
+    assert len(sweep.plans[0].group.settings) > 5
 
 
 def test_a_task_that_refuses_its_settings():

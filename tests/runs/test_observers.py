@@ -42,8 +42,8 @@ class Run:
 def watched(tmp_path, monkeypatch):
     """The files of a run that has begun, what is written, what cannot be, what it said, the run."""
     written, full, said, run = [], set(), [], Run()
-    part = SimpleNamespace(ready=SimpleNamespace(policy={"policy": "normal"}))
-    prepared = SimpleNamespace(known={}, found=None, parts=[part])
+    plan = SimpleNamespace(ready=SimpleNamespace(policy={"policy": "normal"}))
+    prepared = SimpleNamespace(saved_record={}, checkpoint=None, plans=[plan])
     files = RunFiles(tmp_path, prepared, said.append)
     files.began(run)
     assert {path.name for path in tmp_path.iterdir()} == {"config.json", "metrics.csv"}

@@ -176,7 +176,7 @@ def test_a_plan_says_how_many_devices_compute(monkeypatch, seeds, episodes, said
     config = Config(num_seeds=seeds, num_episodes=episodes)
     division = plan.divide_run(config)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert plan._where(division) == said
+    assert plan._describe_devices(division) == said
 
 
 def test_alarms_are_silenced_for_the_command_line_alone(run, monkeypatch):

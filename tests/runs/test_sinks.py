@@ -42,8 +42,8 @@ def begin(directory, config):
     """Begins a run in a directory, or goes on without a checkpoint."""
     record = SimpleNamespace(env_steps=np.zeros(1))
     run = SimpleNamespace(config=config, updates=lambda: 0, record=record)
-    part = SimpleNamespace(ready=SimpleNamespace(policy={}))
-    prepared = SimpleNamespace(known={}, found=None, parts=[part])
+    plan = SimpleNamespace(ready=SimpleNamespace(policy={}))
+    prepared = SimpleNamespace(saved_record={}, checkpoint=None, plans=[plan])
     files = RunFiles(directory, prepared, lambda text: None)
     files.open()
     files.began(run)
