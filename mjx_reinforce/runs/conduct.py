@@ -74,10 +74,19 @@ def conduct(
         settings = {name: values[runs.place] for name, values in plan.group.settings.items()}
         slots = Slots(compiled, runs.seed, settings)
         if prepared.alone:
-            given = config, plan.ready.threshold, slots, runs, prepared.checkpoint, prepared.actors
-            driver = begin_run(*given, display.say, all_observers, interrupt.heard)
+            driver = begin_run(
+                config,
+                plan.ready.threshold,
+                slots,
+                runs,
+                prepared.checkpoint,
+                actors=prepared.actors,
+                say=display.say,
+                observers=all_observers,
+                interrupted=interrupt.heard,
+            )
         else:
-            driver = Training(config, slots, Record(config), runs, all_observers)
+            driver = Training(config, slots, Record(config), runs, observers=all_observers)
         for observer in all_observers:
             observer.began(driver)
         driver.drive(interrupt.heard)
