@@ -3,13 +3,12 @@
 import dataclasses
 import gc
 import os
-import shlex
 import sys
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import NoReturn
 
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
@@ -17,7 +16,7 @@ from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.streams import accept_everything, say_error, silence_alarms
 from mjx_reinforce.files import MovedError
 from mjx_reinforce.runs.design import Design, SweepSettings, check_swept, read_design, read_over
-from mjx_reinforce.runs.perform import Outcome, locked, perform
+from mjx_reinforce.runs.perform import perform, report_on
 from mjx_reinforce.settings.config import (
     CODE,
     Config,
@@ -30,10 +29,6 @@ from mjx_reinforce.settings.defaults import PRESETS, flag_value, for_arguments, 
 from mjx_reinforce.settings.flags import about_word, cannot_load, read_command_line
 from mjx_reinforce.settings.groups import GROUPS
 from mjx_reinforce.training import resume
-
-if TYPE_CHECKING:
-    from mjx_reinforce.report import WrittenReport
-
 
 _TRAIN = (
     "Train policies by REINFORCE on MuJoCo, many seeds at once, and report over the seeds. Writes "
@@ -287,55 +282,3 @@ def refuse(message: str, status: int = 2) -> NoReturn:
     """Says in one line what is wrong, and exits."""
     say_error(message)
     sys.exit(status)
-
-
-def report_on(outcome: Outcome, *, report: bool = True) -> None:
-    """Says what a run or a sweep found, whose report is written, if that is asked for."""
-    display = outcome.display
-    directory = outcome.directory
-    summary = outcome.summary
-    assert directory is not None
-    if "over" not in summary:
-        settings = vars(outcome.driver.config) if outcome.driver else {}
-        # Playing a policy runs the code of these two only; going on runs that of all settings.
-        for_playing = {name: settings[name] for name in ("env", "policy") if name in settings}
-        display.show_summary(summary, directory, code_flags(settings), code_flags(for_playing))
-        return
-    if summary["status"] == "interrupted":
-        flags = code_flags(summary["settings"])
-        display.say(f"interrupted; go on with --resume {directory}{flags}")
-        return
-    if outcome.driver is None and (directory / "report.html").exists():
-        display.say(f"the sweep in {directory} is finished")
-        return
-    took = (
-        f"compiling took {summary['compile_seconds']:.1f} s, training and evaluating "
-        f"{summary['run_seconds']:.1f} s"
-    )
-    if not report:
-        display.say(f"{took}. Files in {directory}")
-        return
-    display.say("writing the report")
-    # The lock of training is gone by now, and --resume in another process would write here, too.
-    with locked(directory):
-        written = _report(directory)
-    took += f", statistics and report {written.seconds:.1f} s"
-    for sentence in (*written.answer, f"{took}. Files in {directory}, first report.html"):
-        display.say(sentence)
-    display.show_commands(_watch(directory, written.best, summary["settings"]))
-
-
-def _report(directory: Path) -> "WrittenReport":
-    """Writes the report of a sweep; removes what a crash left of writing it."""
-    from mjx_reinforce import report
-
-    for leftover in [*directory.glob(".report.html.*"), *(directory / "report").glob(".*")]:
-        leftover.unlink()
-    return report.write_report([directory], directory / "report.html")
-
-
-def _watch(directory: Path, number: int, settings: Mapping[str, Any]) -> dict[str, str]:
-    """Returns the command that plays the best policy of a configuration, after what it does."""
-    place = shlex.quote(str(directory / "policies" / f"{number:03d}"))
-    flags = code_flags({name: settings[name] for name in ("env", "policy")})
-    return {"To see the best of it play": f"{command('watch')} {place}{flags}"}

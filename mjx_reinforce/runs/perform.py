@@ -6,8 +6,9 @@ Its directory is made, tried and locked before anything heavy is imported.
 import contextlib
 import errno
 import os
+import shlex
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,13 +21,16 @@ except ImportError as error:
     ) from error
 
 from mjx_reinforce import envs
+from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.files import check_place
 from mjx_reinforce.runs.design import Design, check_design
+from mjx_reinforce.settings.config import code_flags
 from mjx_reinforce.training.resume import read_record
 
 if TYPE_CHECKING:
+    from mjx_reinforce.report import WrittenReport
     from mjx_reinforce.runs.display import Display
     from mjx_reinforce.training.driver import Observer, Training
 
@@ -251,3 +255,55 @@ def _display(*, quiet: bool) -> "Display":
     from mjx_reinforce.runs.display import Display
 
     return Display(quiet=quiet)
+
+
+def report_on(outcome: Outcome, *, report: bool = True) -> None:
+    """Says what a run or a sweep found, whose report is written, if that is asked for."""
+    display = outcome.display
+    directory = outcome.directory
+    summary = outcome.summary
+    assert directory is not None
+    if "over" not in summary:
+        settings = vars(outcome.driver.config) if outcome.driver else {}
+        # Playing a policy runs the code of these two only; going on runs that of all settings.
+        for_playing = {name: settings[name] for name in ("env", "policy") if name in settings}
+        display.show_summary(summary, directory, code_flags(settings), code_flags(for_playing))
+        return
+    if summary["status"] == "interrupted":
+        flags = code_flags(summary["settings"])
+        display.say(f"interrupted; go on with --resume {directory}{flags}")
+        return
+    if outcome.driver is None and (directory / "report.html").exists():
+        display.say(f"the sweep in {directory} is finished")
+        return
+    took = (
+        f"compiling took {summary['compile_seconds']:.1f} s, training and evaluating "
+        f"{summary['run_seconds']:.1f} s"
+    )
+    if not report:
+        display.say(f"{took}. Files in {directory}")
+        return
+    display.say("writing the report")
+    # The lock of training is gone by now, and --resume in another process would write here, too.
+    with locked(directory):
+        written = _report(directory)
+    took += f", statistics and report {written.seconds:.1f} s"
+    for sentence in (*written.answer, f"{took}. Files in {directory}, first report.html"):
+        display.say(sentence)
+    display.show_commands(_watch_command(directory, written.best, summary["settings"]))
+
+
+def _report(directory: Path) -> "WrittenReport":
+    """Writes the report of a sweep; removes what a crash left of writing it."""
+    from mjx_reinforce import report
+
+    for leftover in [*directory.glob(".report.html.*"), *(directory / "report").glob(".*")]:
+        leftover.unlink()
+    return report.write_report([directory], directory / "report.html")
+
+
+def _watch_command(directory: Path, number: int, settings: Mapping[str, Any]) -> dict[str, str]:
+    """Returns the command that plays the best policy of a configuration, after what it does."""
+    place = shlex.quote(str(directory / "policies" / f"{number:03d}"))
+    flags = code_flags({name: settings[name] for name in ("env", "policy")})
+    return {"To see the best of it play": f"{command('watch')} {place}{flags}"}

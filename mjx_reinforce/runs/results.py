@@ -17,9 +17,8 @@ from mjx_reinforce.export.policy_files import Player, played_policy
 from mjx_reinforce.export.run_files import Which
 from mjx_reinforce.files import Arrays, naming_damage, read_arrays, read_json
 from mjx_reinforce.learning.policy import Actor, Policy
-from mjx_reinforce.runs.command_line import report_on
 from mjx_reinforce.runs.design import Design, check_swept
-from mjx_reinforce.runs.perform import perform
+from mjx_reinforce.runs.perform import perform, report_on
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import worst_if_not_finite
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer

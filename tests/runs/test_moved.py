@@ -8,7 +8,7 @@ import pytest
 
 from mjx_reinforce import train
 from mjx_reinforce.report import WrittenReport
-from mjx_reinforce.runs import command_line, plan, saving
+from mjx_reinforce.runs import command_line, perform, plan, saving
 from mjx_reinforce.runs.saving import Files, RunFiles, SweepFiles
 from mjx_reinforce.training import driver
 
@@ -119,5 +119,5 @@ def test_a_report_that_is_being_written(run, monkeypatch, capsys):
         (directory / "report.html").write_text("page")
         return WrittenReport(0.0, [], 0)
 
-    monkeypatch.setattr(command_line, "_report", report)
+    monkeypatch.setattr(perform, "_report", report)
     check_lost(run(*SWEEP, command=command_line.sweep), "moved", capsys)
