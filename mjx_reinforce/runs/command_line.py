@@ -86,7 +86,7 @@ def parse(arguments: Sequence[str], name: str = "train") -> Design:
     over = read_over(sweep.over)
     # A sweep may be named by its --over again, which is how its user confirms code of their own.
     as_before = over in ({}, design.over) and sweep == SweepSettings(over=sweep.over)
-    if not as_before or (design.over and base != design.base):
+    if not as_before or (design.is_sweep and base != design.base):
         raise ValueError(f"what is in {directory} goes on as it is: give --resume alone")
     if not over and any(is_own(x) for name in CODE for x in design.over.get(name, ())):
         raise ValueError(
@@ -95,7 +95,7 @@ def parse(arguments: Sequence[str], name: str = "train") -> Design:
         )
     resume.check_settings(design.base, base)
     # A finished sweep may still lack its report, so ``perform`` is to look at that.
-    if not design.over and resume.is_done(design.base, base):
+    if not design.is_sweep and resume.is_done(design.base, base):
         print(
             f"{directory} is finished; to go on, give a larger --env-steps or --max-updates, or "
             "--minutes"
@@ -243,7 +243,7 @@ def _train(name: str, interrupt: Interrupt) -> int:
         _refuse_full(error, design)
     if outcome.summary["status"] != "interrupted" or interrupt.number is None:
         return int(outcome.summary["status"] == "stopped")
-    if design.over:
+    if design.is_sweep:
         # The next group may still compile in a thread, whose end an ordinary exit would await.
         interrupt.leave(128 + interrupt.number)
     return 128 + interrupt.number
@@ -263,12 +263,12 @@ def _refuse_full(error: RuntimeError | MemoryError | OSError, design: Design) ->
             remedy = f"go on with --resume {design.directory}{code_flags(vars(design.base))}"
         # Errors of W&B have no number, and more room would not help.
         room = "make room, then" if error.errno else "then"
-        kind = "sweep" if design.over else "run"
-        refuse(f"cannot write the files of this {kind} ({error}); {room} {remedy}", status=1)
+        files = f"the files of this {design.kind}"
+        refuse(f"cannot write {files} ({error}); {room} {remedy}", status=1)
     # JAX reports a full device as a RuntimeError with this status in its text.
     if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
         raise error
-    if design.over:
+    if design.is_sweep:
         subject = "a chunk"
         flag = "--chunk-runs"
     else:

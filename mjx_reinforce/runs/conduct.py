@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import itertools
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from mjx_reinforce.console.interrupt import Interrupt
@@ -47,7 +47,7 @@ def conduct(
         if chunks:
             unfinished_groups.append(plan._replace(chunks=chunks))
     screen = display
-    if not prepared.alone:
+    if prepared.design.is_sweep:
         screen = SweepScreen(display, prepared, unfinished_groups)
     # The files are first: an error of theirs ends the run before a user's function sees an
     # evaluation that is nowhere on the disk.
@@ -73,7 +73,9 @@ def conduct(
         config = dataclasses.replace(plan.group.config, num_seeds=len(runs.seed))
         settings = {name: values[runs.place] for name, values in plan.group.settings.items()}
         slots = Slots(compiled, runs.seed, settings)
-        if prepared.alone:
+        if prepared.design.is_sweep:
+            driver = Training(config, slots, Record(config), runs, observers=all_observers)
+        else:
             driver = begin_run(
                 config,
                 plan.ready.threshold,
@@ -85,8 +87,6 @@ def conduct(
                 observers=all_observers,
                 interrupted=interrupt.heard,
             )
-        else:
-            driver = Training(config, slots, Record(config), runs, observers=all_observers)
         for observer in all_observers:
             observer.began(driver)
         driver.drive(interrupt.heard)
@@ -95,20 +95,37 @@ def conduct(
         # A chunk that is not done was interrupted, and so is what would follow it.
         if not driver.record.done():
             break
-    if isinstance(driver, Driver):
+    if prepared.design.is_sweep:
+        assert files is not None
+        summary = _sweep_summary(files.contents, driver, clock)
+    else:
+        assert isinstance(driver, Driver)
         # A signal after that changes nothing: what is left takes a second or two.
         test = driver.test(interrupt.heard)
         summary = driver.summary(prepared.plans[0].ready.engine, clock.compiling, test)
-    else:
-        assert files is not None
-        is_done = driver is None or driver.record.done()
-        summary = dict(files.contents, status="finished" if is_done else "interrupted")
-        # A sweep that was resumed has spent time before, which its sweep.json says.
-        summary["compile_seconds"] += clock.compiling
-        summary["run_seconds"] += clock.running()
     for observer in all_observers:
         observer.finished(driver, summary)
     return driver, summary
+
+
+def _sweep_summary(
+    contents: Mapping[str, Any], driver: Training | None, clock: Stopwatch
+) -> dict[str, Any]:
+    """Returns the contents of sweep.json at the end.
+
+    Args:
+      contents: of sweep.json so far.
+      driver: of the chunk that was trained last; None if nothing was left to train.
+      clock: of this process.
+    """
+    is_done = driver is None or driver.record.done()
+    return {
+        **contents,
+        "status": "finished" if is_done else "interrupted",
+        # A sweep that was resumed has spent time before, which its sweep.json says.
+        "compile_seconds": contents["compile_seconds"] + clock.compiling,
+        "run_seconds": contents["run_seconds"] + clock.running(),
+    }
 
 
 def _compiled(

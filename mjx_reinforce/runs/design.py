@@ -66,6 +66,16 @@ class Design:
     chunk_runs: int | None = None
 
     @property
+    def is_sweep(self) -> bool:
+        """Whether it is a sweep; a run is one configuration, and goes over nothing."""
+        return bool(self.over)
+
+    @property
+    def kind(self) -> str:
+        """What people call it: a run or a sweep."""
+        return "sweep" if self.is_sweep else "run"
+
+    @property
     def chosen_names(self) -> tuple[str, ...]:
         """The names of the settings that the user chose."""
         return () if self.default is None else changed(self.base, self.default)
@@ -107,6 +117,7 @@ def read_design(directory: Path) -> Design:
       ValueError: there is none, or its first file is damaged or of another version.
     """
     record = read_record(directory)
+    # Of the first files that of a sweep alone has this entry.
     if "over" not in record:
         base = as_config(record, directory / "config.json")
         return Design(base=dataclasses.replace(base, resume=directory))
@@ -128,7 +139,7 @@ def check_design(design: Design) -> None:
 
     A configuration reads each setting that is swept, and one of them each that was given.
     """
-    if design.over:
+    if design.is_sweep:
         _check_sweep(design)
     check_each(design.base)
     # By the count alone: ``design.configs`` below would itself fill the memory.

@@ -166,6 +166,7 @@ def locked(directory: Path) -> Iterator[None]:
 class Outcome(NamedTuple):
     """What came of a run or a sweep.
 
+    design: what was to be done
     directory: of its files, None where none were asked for
     summary: what summary.json or sweep.json says
     driver: of the runs that were trained last; None where nothing was left to do
@@ -173,6 +174,7 @@ class Outcome(NamedTuple):
     display: its screen
     """
 
+    design: Design
     directory: Path | None
     summary: dict[str, Any]
     driver: "Training | None"
@@ -214,7 +216,7 @@ def perform(
         saved_record = read_record(design.directory) if resumed else {}
         # Only sweep.json has a status: a finished run goes on with a larger budget.
         if saved_record.get("status") == "finished":
-            return Outcome(directory, saved_record, None, {}, _display(quiet=quiet))
+            return Outcome(design, directory, saved_record, None, {}, _display(quiet=quiet))
         # A module of the user's is imported before JAX starts, which it may set up.
         first = design.configs[0]
         env = None
@@ -244,10 +246,11 @@ def perform(
             if directory is not None and place is not None:
                 # Writing the simulation out took its time, in which it may have been moved.
                 check_place(directory, place)
-                kind = SweepFiles if design.over else RunFiles
-                own_files = kind(directory, prepared, display.say)
+                files_class = SweepFiles if design.is_sweep else RunFiles
+                own_files = files_class(directory, prepared, display.say)
             driver, summary = conduct(prepared, own_files, display, observers, interrupt)
-        return Outcome(directory, summary, driver, prepared.plans[0].ready.policy, display)
+        policy = prepared.plans[0].ready.policy
+        return Outcome(design, directory, summary, driver, policy, display)
 
 
 def _display(*, quiet: bool) -> "Display":
@@ -263,7 +266,7 @@ def report_on(outcome: Outcome, *, report: bool = True) -> None:
     directory = outcome.directory
     summary = outcome.summary
     assert directory is not None
-    if "over" not in summary:
+    if not outcome.design.is_sweep:
         settings = vars(outcome.driver.config) if outcome.driver else {}
         # Playing a policy runs the code of these two only; going on runs that of all settings.
         for_playing = {name: settings[name] for name in ("env", "policy") if name in settings}

@@ -86,11 +86,6 @@ class Prepared(NamedTuple):
     actors: Actor | None
     clock: Stopwatch
 
-    @property
-    def alone(self) -> bool:
-        """Whether it is a run, which is one configuration."""
-        return not self.design.over
-
 
 def prepare(
     design: Design,
@@ -112,7 +107,7 @@ def prepare(
     clock = Stopwatch()
     if design.base.resume is not None:
         resume.check_same_program(design.directory, saved_record, provenance())
-    if design.over:
+    if design.is_sweep:
         plans, division = _plan_sweep(design, saved_record)
         return Prepared(design, plans, division, saved_record, None, None, clock)
     config = design.base
@@ -341,7 +336,7 @@ def describe(prepared: Prepared) -> str:
     ready = plans[0].ready
     subject = f"{counted(config.num_seeds, 'seed')} of {config.env}"
     programs = ""
-    if not prepared.alone:
+    if prepared.design.is_sweep:
         sizes = [len(runs.seed) for plan in plans for runs in plan.chunks]
         configurations = counted(prepared.design.count(), "configuration")
         subject = f"{configurations} of {subject}, {sum(sizes):,} runs,"
