@@ -86,7 +86,7 @@ def test_a_checkpoint_is_written_once_there_were_enough_updates(watched):
 
 def test_a_checkpoint_is_due_after_a_minute(watched, monkeypatch):
     files, written, _, _, run = watched
-    run.config, now = Config(num_seeds=2, checkpoint_every=None), [files._at]
+    run.config, now = Config(num_seeds=2, checkpoint_every=None), [files._saved_at]
     monkeypatch.setattr(saving.time, "perf_counter", lambda: now[0])
     for passed, expected in ((59.0, []), (1.0, saved(10**9)), (59.0, saved(10**9))):
         now[0] += passed
