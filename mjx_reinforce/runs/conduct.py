@@ -9,7 +9,7 @@ from typing import Any
 
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.runs.display import Display, SweepScreen
-from mjx_reinforce.runs.plan import GroupPlan, Prepared
+from mjx_reinforce.runs.plan import GroupPlan, Plan
 from mjx_reinforce.runs.saving import Files
 from mjx_reinforce.setup.compile_times import keep_seconds
 from mjx_reinforce.training.driver import Driver, Observer, Runs, Training, begin_run
@@ -18,7 +18,7 @@ from mjx_reinforce.training.slots import Compiled, Slots, Stopwatch, compile_slo
 
 
 def conduct(
-    prepared: Prepared,
+    plan: Plan,
     files: Files[Any] | None,
     display: Display,
     observers: Sequence[Observer[Any]],
@@ -27,7 +27,7 @@ def conduct(
     """Trains the chunks that have not ended yet, to their end or until they are interrupted.
 
     Args:
-      prepared: what a run or a sweep is made of.
+      plan: what a run or a sweep is made of.
       files: of it. A sweep always has some; a run has None if it is to leave nothing.
       display: its screen.
       observers: who sees it, besides these.
@@ -42,17 +42,17 @@ def conduct(
     # No loop below runs for the files of a run that leaves none.
     own_files = [] if files is None else [files]
     unfinished_groups = []
-    for plan in prepared.plans:
-        chunks = [x for x in plan.chunks if not any(file.has(x.name) for file in own_files)]
+    for group_plan in plan.group_plans:
+        chunks = [x for x in group_plan.chunks if not any(file.has(x.name) for file in own_files)]
         if chunks:
-            unfinished_groups.append(plan._replace(chunks=chunks))
+            unfinished_groups.append(group_plan._replace(chunks=chunks))
     screen = display
-    if prepared.design.is_sweep:
-        screen = SweepScreen(display, prepared, unfinished_groups)
+    if plan.design.is_sweep:
+        screen = SweepScreen(display, plan, unfinished_groups)
     # The files are first: an error of theirs ends the run before a user's function sees an
     # evaluation that is nowhere on the disk.
     all_observers = [*own_files, screen, *observers]
-    clock = prepared.clock
+    clock = plan.clock
     # A generator compiles when it is first asked. The first chunk is taken from it here, so that
     # all compiling that nothing runs beside is before the clock is read.
     compiled_chunks = _compiled(unfinished_groups, clock)
@@ -61,28 +61,28 @@ def conduct(
     # Where others compute beside this, what it computed itself is nearer to a quiet machine's time.
     quiet_seconds = min(clock.compiling, time.process_time() - clock.computed)
     if unfinished_groups:
-        keep_seconds(prepared.design.configs[0], prepared.design.over, quiet_seconds)
+        keep_seconds(plan.design.configs[0], plan.design.over, quiet_seconds)
     # Not before: a kill while it compiles leaves nothing that would refuse the next.
     interrupt.defer(display.say)
     for file in own_files:
         file.open()
     display.start(clock.compiling)
     driver = None
-    for plan, runs, compiled in compiled_chunks:
+    for group_plan, runs, compiled in compiled_chunks:
         # The number of seeds is here that of the chunk's runs, whatever configuration each is of.
-        config = dataclasses.replace(plan.group.config, num_seeds=len(runs.seed))
-        settings = {name: values[runs.place] for name, values in plan.group.settings.items()}
+        config = dataclasses.replace(group_plan.group.config, num_seeds=len(runs.seed))
+        settings = {name: values[runs.place] for name, values in group_plan.group.settings.items()}
         slots = Slots(compiled, runs.seed, settings)
-        if prepared.design.is_sweep:
+        if plan.design.is_sweep:
             driver = Training(config, slots, Record(config), runs, observers=all_observers)
         else:
             driver = begin_run(
                 config,
-                plan.ready.threshold,
+                group_plan.ready.threshold,
                 slots,
                 runs,
-                prepared.checkpoint,
-                actors=prepared.actors,
+                plan.checkpoint,
+                actors=plan.actors,
                 say=display.say,
                 observers=all_observers,
                 interrupted=interrupt.heard,
@@ -95,14 +95,14 @@ def conduct(
         # A chunk that is not done was interrupted, and so is what would follow it.
         if not driver.record.done():
             break
-    if prepared.design.is_sweep:
+    if plan.design.is_sweep:
         assert files is not None
         summary = _sweep_summary(files.contents, driver, clock)
     else:
         assert isinstance(driver, Driver)
         # A signal after that changes nothing: what is left takes a second or two.
         test = driver.test(interrupt.heard)
-        summary = driver.summary(prepared.plans[0].ready.engine, clock.compiling, test)
+        summary = driver.summary(plan.group_plans[0].ready.engine, clock.compiling, test)
     for observer in all_observers:
         observer.finished(driver, summary)
     return driver, summary
@@ -129,20 +129,22 @@ def _sweep_summary(
 
 
 def _compiled(
-    plans: Sequence[GroupPlan], clock: Stopwatch
+    group_plans: Sequence[GroupPlan], clock: Stopwatch
 ) -> Iterator[tuple[GroupPlan, Runs, Compiled]]:
     """Yields chunks with the programs of their group; those of the next compile meanwhile."""
     # A list with the task of the group that is next, or with none behind the last one.
-    tasks = [functools.partial(_compile, plan) for plan in plans[:1]]
-    for number, plan in enumerate(plans, start=1):
+    tasks = [functools.partial(_compile, group_plan) for group_plan in group_plans[:1]]
+    for number, group_plan in enumerate(group_plans, start=1):
         compiled = clock.wait(tasks.pop())
         # One group ahead, and not all: compiling takes memory and cores from what trains.
-        following = [functools.partial(_compile, later) for later in plans[number : number + 1]]
+        following = [
+            functools.partial(_compile, later) for later in group_plans[number : number + 1]
+        ]
         tasks = [started(task).result for task in following]
-        for runs in plan.chunks:
-            yield plan, runs, compiled
+        for runs in group_plan.chunks:
+            yield group_plan, runs, compiled
 
 
-def _compile(plan: GroupPlan) -> Compiled:
+def _compile(group_plan: GroupPlan) -> Compiled:
     """Returns the programs of a group."""
-    return compile_slots(plan.ready.programs(), plan.group.config, plan.width)
+    return compile_slots(group_plan.ready.programs(), group_plan.group.config, group_plan.width)

@@ -18,7 +18,7 @@ from rich.text import Text
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.reports.experiment import counted, say, setting_in_words
-from mjx_reinforce.runs.plan import GroupPlan, Prepared
+from mjx_reinforce.runs.plan import GroupPlan, Plan
 from mjx_reinforce.statistics import enough, iqm
 from mjx_reinforce.training import record
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer, Training
@@ -172,15 +172,17 @@ class Display(Observer[Driver]):
 class SweepScreen(Observer[Training]):
     """Shows how far a sweep is, and which of its runs are trained."""
 
-    def __init__(self, display: Display, prepared: Prepared, plans: Iterable[GroupPlan]):
+    def __init__(self, display: Display, plan: Plan, group_plans: Iterable[GroupPlan]):
         """Takes the display, the sweep, and what of it is to be trained."""
         self._display = display
-        self._prepared = prepared
+        self._plan = plan
         #: How many runs have ended in this process.
         self._num_ended = 0
         #: Whole budgets of runs that checkpoints had used before this process.
         self._budgets_before = 0.0
-        self._num_runs = sum(len(runs.seed) for plan in plans for runs in plan.chunks)
+        self._num_runs = sum(
+            len(runs.seed) for group_plan in group_plans for runs in group_plan.chunks
+        )
 
     def began(self, driver: Training) -> None:
         """Says which configurations the lines that follow are of."""
@@ -188,7 +190,7 @@ class SweepScreen(Observer[Training]):
         # this chunk was trained by this process.
         self._budgets_before += driver.record.used_up()
         runs = driver.runs
-        configurations = self._prepared.design.configurations
+        configurations = self._plan.design.configurations
         in_chunk = [configurations[number] for number in np.unique(runs.configuration)]
         settings = []
         for name in in_chunk[0]:
@@ -207,7 +209,7 @@ class SweepScreen(Observer[Training]):
         # The time left is estimated from what this process trained: the time that earlier ones
         # took is in no clock of it.
         gained = float(budgets - self._budgets_before) / self._num_runs
-        running = self._prepared.clock.running()
+        running = self._plan.clock.running()
         progress = driver.record.measure(fraction, driver.seconds(), gained, running)
         self._display.show_progress(progress)
 

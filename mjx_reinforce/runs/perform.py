@@ -227,7 +227,7 @@ def perform(
             configure_jax()
             from mjx_reinforce.envs.instability import instability
             from mjx_reinforce.runs.conduct import conduct
-            from mjx_reinforce.runs.plan import describe, prepare
+            from mjx_reinforce.runs.plan import describe, make_plan
             from mjx_reinforce.runs.saving import RunFiles, SweepFiles
             from mjx_reinforce.setup.compile_times import describe_compiling
         except MemoryError as error:
@@ -238,8 +238,8 @@ def perform(
         if (model := getattr(env, "mj_model", None)) is not None:
             display.warn_of_model(instability(model))
         with display.console.status("writing the simulation out"):
-            prepared = prepare(design, saved_record, env, display.say)
-        display.say(describe(prepared))
+            plan = make_plan(design, saved_record, env, display.say)
+        display.say(describe(plan))
         display.say(describe_compiling(first, design.over))
         with display:
             own_files = None
@@ -247,9 +247,9 @@ def perform(
                 # Writing the simulation out took its time, in which it may have been moved.
                 check_place(directory, place)
                 files_class = SweepFiles if design.is_sweep else RunFiles
-                own_files = files_class(directory, prepared, display.say)
-            driver, summary = conduct(prepared, own_files, display, observers, interrupt)
-        policy = prepared.plans[0].ready.policy
+                own_files = files_class(directory, plan, display.say)
+            driver, summary = conduct(plan, own_files, display, observers, interrupt)
+        policy = plan.group_plans[0].ready.policy
         return Outcome(design, directory, summary, driver, policy, display)
 
 

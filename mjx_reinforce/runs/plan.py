@@ -66,11 +66,11 @@ class GroupPlan(NamedTuple):
     chunks: list[Runs]
 
 
-class Prepared(NamedTuple):
+class Plan(NamedTuple):
     """All that a run or a sweep is made of.
 
     design: what it is to do
-    plans: of its groups
+    group_plans: how each of its groups is trained
     division: among which devices the runs are divided
     saved_record: what the first file of its directory says, if it goes on
     checkpoint: from which a run goes on, if there is one
@@ -79,7 +79,7 @@ class Prepared(NamedTuple):
     """
 
     design: Design
-    plans: list[GroupPlan]
+    group_plans: list[GroupPlan]
     division: Division
     saved_record: Mapping[str, Any]
     checkpoint: Checkpoint | None
@@ -87,12 +87,12 @@ class Prepared(NamedTuple):
     clock: Stopwatch
 
 
-def prepare(
+def make_plan(
     design: Design,
     saved_record: Mapping[str, Any],
     env: Environment | None,
     say: Callable[[str], None],
-) -> Prepared:
+) -> Plan:
     """Returns what a run or a sweep is made of.
 
     Args:
@@ -108,8 +108,8 @@ def prepare(
     if design.base.resume is not None:
         resume.check_same_program(design.directory, saved_record, provenance())
     if design.is_sweep:
-        plans, division = _plan_sweep(design, saved_record)
-        return Prepared(design, plans, division, saved_record, None, None, clock)
+        group_plans, division = _plan_sweep(design, saved_record)
+        return Plan(design, group_plans, division, saved_record, None, None, clock)
     config = design.base
     # A sweep has checkpoints, too, but one a chunk: its files look for them as it gets there.
     checkpoint = None
@@ -125,14 +125,14 @@ def prepare(
     # version, where the task's own may be another.
     config = dataclasses.replace(config, horizon=ready.horizon)
     group = Group(config, members=np.zeros(1, int), settings={})
-    plan = GroupPlan(
+    group_plan = GroupPlan(
         group=group,
         ready=ready,
         limit=config.num_seeds,
         width=division.lanes(config.num_seeds),
         chunks=split_runs(group, "000", 1),
     )
-    return Prepared(design, [plan], division, saved_record, checkpoint, actors, clock)
+    return Plan(design, [group_plan], division, saved_record, checkpoint, actors, clock)
 
 
 #: Episodes are divided among GPUs only where each plays so many of an update, of all seeds: fewer
@@ -190,7 +190,7 @@ def _plan_sweep(
             f"{design.directory} was begun on {saved_count} devices, and here are "
             f"{division.count}; go on with as many"
         )
-    plans = []
+    group_plans = []
     for number, group in enumerate(make_groups(design)):
         config = group.config
         # ``get_ready`` refuses what the policy does not read and differs from the default. Here
@@ -209,8 +209,8 @@ def _plan_sweep(
             limit = min(max(_capacity(group, ready), division.count), group.num_runs)
         num_chunks, width = divide(group, limit, division.count, exact=design.exact)
         chunks = split_runs(group, f"{number:03d}", num_chunks)
-        plans.append(GroupPlan(group, ready, limit, width, chunks))
-    return plans, division
+        group_plans.append(GroupPlan(group, ready, limit, width, chunks))
+    return group_plans, division
 
 
 def make_groups(design: Design) -> list[Group]:
@@ -328,23 +328,21 @@ def _capacity(group: Group, ready: Ready) -> int:
     return max(1, int(_MEMORY * host_memory() / (_COPIES * state_bytes)))
 
 
-def describe(prepared: Prepared) -> str:
+def describe(plan: Plan) -> str:
     """Returns a sentence on what a run or a sweep will do on this machine."""
-    plans = prepared.plans
+    group_plans = plan.group_plans
     # Of a sweep the first configuration is named; the others may differ in what is swept.
-    config = plans[0].group.config
-    ready = plans[0].ready
+    config = group_plans[0].group.config
+    ready = group_plans[0].ready
     subject = f"{counted(config.num_seeds, 'seed')} of {config.env}"
     programs = ""
-    if prepared.design.is_sweep:
-        sizes = [len(runs.seed) for plan in plans for runs in plan.chunks]
-        configurations = counted(prepared.design.count(), "configuration")
+    if plan.design.is_sweep:
+        sizes = [len(runs.seed) for group_plan in group_plans for runs in group_plan.chunks]
+        configurations = counted(plan.design.count(), "configuration")
         subject = f"{configurations} of {subject}, {sum(sizes):,} runs,"
-        programs = (
-            f"; {counted(len(plans), 'compiled program')}, {counted(len(sizes), 'chunk')} of up to "
-            f"{max(sizes):,} runs"
-        )
-    devices = _describe_devices(prepared.division)
+        count = counted(len(group_plans), "compiled program")
+        programs = f"; {count}, {counted(len(sizes), 'chunk')} of up to {max(sizes):,} runs"
+    devices = _describe_devices(plan.division)
     return (
         f"Training {subject} by {config.algorithm}, {_budget(config)}, on {devices}, with the "
         f"engine {ready.engine}: {ready.why}{programs}."

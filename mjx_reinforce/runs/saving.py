@@ -32,7 +32,7 @@ from mjx_reinforce.files import (
 from mjx_reinforce.reports.charts import curves
 from mjx_reinforce.reports.experiment import lengthened
 from mjx_reinforce.runs.design import as_record
-from mjx_reinforce.runs.plan import GroupPlan, Prepared
+from mjx_reinforce.runs.plan import GroupPlan, Plan
 from mjx_reinforce.runs.sinks import Sink, open_sinks
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup.provenance import provenance
@@ -57,19 +57,19 @@ class Files(Observer[Seen]):
     #: Folders in which files are written, beside the directory itself.
     _folders: tuple[str, ...] = ()
 
-    def __init__(self, directory: Path, prepared: Prepared, say: Callable[[str], None]):
+    def __init__(self, directory: Path, plan: Plan, say: Callable[[str], None]):
         """Takes the files before they are there.
 
         Args:
           directory: where they are.
-          prepared: what the run or the sweep is made of.
+          plan: what the run or the sweep is made of.
           say: shows a line to the user.
         """
         self._directory = directory
-        self._prepared = prepared
+        self._plan = plan
         self._say = say
         self._place = directory.stat()
-        self.contents = dict(prepared.saved_record)
+        self.contents = dict(plan.saved_record)
         #: What could not be written when it was last tried.
         self._failing: set[str] = set()
         #: The end of a warning that something could not be written.
@@ -176,9 +176,9 @@ class RunFiles(Files[Driver]):
 
     _folders = ("policy", "policy/best", "wandb")
 
-    def __init__(self, directory: Path, prepared: Prepared, say: Callable[[str], None]):
+    def __init__(self, directory: Path, plan: Plan, say: Callable[[str], None]):
         """Takes the files of a run, before they are there; arguments as of ``Files``."""
-        super().__init__(directory, prepared, say)
+        super().__init__(directory, plan, say)
         self._metrics = directory / "metrics.csv"
         self._checkpoints = directory / "checkpoint"
         #: Rows that could not be written yet.
@@ -192,7 +192,7 @@ class RunFiles(Files[Driver]):
         Raises:
           OSError: a file cannot be written.
         """
-        checkpoint = self._prepared.checkpoint
+        checkpoint = self._plan.checkpoint
         self._go_on(driver, checkpoint)
         if driver.config.resume is None:
             self._write_first(driver.config)
@@ -278,7 +278,7 @@ class RunFiles(Files[Driver]):
 
     def _save_policies(self, driver: Driver) -> None:
         """Writes the last and the best policies."""
-        settings = self._prepared.plans[0].ready.policy
+        settings = self._plan.group_plans[0].ready.policy
         save_policy(self._folder("policy"), driver.states.train_states.actor, settings)
         save_policy(self._folder("policy", "best"), driver.best.actor, settings)
 
@@ -303,31 +303,31 @@ class SweepFiles(Files[Training]):
 
     _folders = ("parts",)
 
-    def __init__(self, directory: Path, prepared: Prepared, say: Callable[[str], None]):
+    def __init__(self, directory: Path, plan: Plan, say: Callable[[str], None]):
         """Takes the files of a sweep, before they are there; arguments as of ``Files``."""
-        super().__init__(directory, prepared, say)
+        super().__init__(directory, plan, say)
         self._parts = directory / "parts"
         self.contents = self._contents()
 
     def _contents(self) -> dict[str, Any]:
         """Returns what sweep.json says while the sweep goes on."""
-        design = self._prepared.design
-        plans = self._prepared.plans
+        design = self._plan.design
+        group_plans = self._plan.group_plans
         # Times and the command of a sweep that goes on are those of its beginning.
-        saved_record = self._prepared.saved_record
+        saved_record = self._plan.saved_record
         return {
             "status": "running",
             "env": design.base.env,
-            "threshold": plans[0].ready.threshold,
+            "threshold": group_plans[0].ready.threshold,
             **as_record(design),
             "num_seeds": design.base.num_seeds,
             "configurations": [
                 {"configuration": number, **values}
                 for number, values in enumerate(design.configurations)
             ],
-            "chunk_runs": [plan.limit for plan in plans],
-            "local_devices": self._prepared.division.count,
-            "engine": plans[0].ready.engine,
+            "chunk_runs": [group_plan.limit for group_plan in group_plans],
+            "local_devices": self._plan.division.count,
+            "engine": group_plans[0].ready.engine,
             "compile_seconds": saved_record.get("compile_seconds", 0.0),
             "run_seconds": saved_record.get("run_seconds", 0.0),
             "command": saved_record.get("command", typed("sweep")),
@@ -374,8 +374,8 @@ class SweepFiles(Files[Training]):
         if summary["status"] == "finished":
             # What a kill at this point left is written again, as a whole.
             shutil.rmtree(self._directory / "policies", ignore_errors=True)
-            for plan in self._prepared.plans:
-                self._write_policies(plan, [parts[runs.name] for runs in plan.chunks])
+            for group_plan in self._plan.group_plans:
+                self._write_policies(group_plan, [parts[runs.name] for runs in group_plan.chunks])
         # Before the parts go: they can make all the files again until this says that it is over.
         self._write_json("sweep.json", summary)
         if summary["status"] == "finished":
@@ -403,13 +403,13 @@ class SweepFiles(Files[Training]):
         ends = {f"ends/{name}": np.asarray(x)[rows] for name, x in last.items()}
         write_arrays(self._parts / f"{runs.name}.npz", curves | ends)
 
-    def _write_policies(self, plan: GroupPlan, chunks: Sequence[Arrays]) -> None:
+    def _write_policies(self, group_plan: GroupPlan, chunks: Sequence[Arrays]) -> None:
         """Writes the policies of the worst and the best seed of each configuration of a group.
 
         Each folder is as the directory of a run.
 
         Args:
-          plan: of the group.
+          group_plan: of the group.
           chunks: the arrays in the part of each of its chunks.
         """
         last = {
@@ -417,8 +417,8 @@ class SweepFiles(Files[Training]):
             for name in chunks[0]
             if name not in _CURVES
         }
-        policy = plan.ready.policy
-        for number in plan.group.members.tolist():
+        policy = group_plan.ready.policy
+        for number in group_plan.group.members.tolist():
             rows = _ends(last, number)
             ends = {name: values[rows] for name, values in last.items()}
             seeds = ends.pop("seed")
@@ -426,14 +426,14 @@ class SweepFiles(Files[Training]):
             # What is left over after this are the arrays of the policies.
             del ends["configuration"]
             place = self._folder("policies", f"{number:03d}")
-            config = self._prepared.design.configs[number]
+            config = self._plan.design.configs[number]
             # ``policy`` is that of the group's first configuration, but for these numbers.
-            traced = {k: getattr(config, k) for k in plan.group.settings if k in policy}
+            traced = {k: getattr(config, k) for k in group_plan.group.settings if k in policy}
             folder = self._folder("policies", place.name, "policy")
             save_policy(folder, actor_of(ends), policy | traced)
             summary = {"status": "finished", "final_returns": returns.tolist()}
             write_json(place / "summary.json", summary)
-            settings = {"env": config.env, "horizon": plan.ready.horizon}
+            settings = {"env": config.env, "horizon": group_plan.ready.horizon}
             if config.env_set:
                 settings["env_set"] = list(config.env_set)
             settings["seeds"] = seeds.tolist()

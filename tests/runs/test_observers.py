@@ -42,9 +42,9 @@ class Run:
 def watched(tmp_path, monkeypatch):
     """The files of a run that has begun, what is written, what cannot be, what it said, the run."""
     written, full, said, run = [], set(), [], Run()
-    plan = SimpleNamespace(ready=SimpleNamespace(policy={"policy": "normal"}))
-    prepared = SimpleNamespace(saved_record={}, checkpoint=None, plans=[plan])
-    files = RunFiles(tmp_path, prepared, said.append)
+    group_plan = SimpleNamespace(ready=SimpleNamespace(policy={"policy": "normal"}))
+    plan = SimpleNamespace(saved_record={}, checkpoint=None, group_plans=[group_plan])
+    files = RunFiles(tmp_path, plan, said.append)
     files.began(run)
     assert {path.name for path in tmp_path.iterdir()} == {"config.json", "metrics.csv"}
 

@@ -151,7 +151,7 @@ def test_what_does_not_fit_into_memory_is_refused_before_it_runs(
 
 def described(config):
     """What is said of a run."""
-    return plan.describe(plan.prepare(Design(base=config), {}, Survive(), pytest.fail))
+    return plan.describe(plan.make_plan(Design(base=config), {}, Survive(), pytest.fail))
 
 
 def test_a_plan_says_what_is_known(monkeypatch):
