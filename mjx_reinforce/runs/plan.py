@@ -193,8 +193,8 @@ def _plan_sweep(
     group_plans = []
     for number, group in enumerate(make_groups(design)):
         config = group.config
-        # ``get_ready`` refuses what the policy does not read and differs from the default. Here
-        # that is what the user chose or sweeps, unless this configuration never reads it anyway.
+        # Refused is what the policy does not read and differs from the default. Here that is what
+        # the user chose or sweeps, unless this configuration does not read it in any case.
         chosen_names = vars(config).keys() & {*design.chosen_names, *design.over}
         unset = {name: None for name in chosen_names if is_read(name, config)}
         default: Any = dataclasses.replace(config, **unset)
