@@ -61,8 +61,10 @@ def write_class(settings: NewSettings) -> None:
     from mjx_reinforce.envs import models
     from mjx_reinforce.envs.instability import instability
 
+    path = str(xml)
     # A file's name alone would mean one of the package's own models.
-    path = str(xml if xml.parent != Path() else Path.cwd() / xml)
+    if xml.parent == Path():
+        path = str(Path.cwd() / xml)
     model = models.load_model(path)
     models.to_mjx(model, path)
     write_bytes(output, class_source(model, xml.name, output.stem).encode())
@@ -147,7 +149,9 @@ def _about(model: "MjModel") -> Iterator[str]:
     """Yields the lines of the class's docstring: what its actions move."""
     for i in range(model.nu):
         low, high = model.actuator_ctrlrange[i]
-        limits = f" in [{low:g}, {high:g}]" if model.actuator_ctrllimited[i] else ""
+        limits = ""
+        if model.actuator_ctrllimited[i]:
+            limits = f" in [{low:g}, {high:g}]"
         name = model.actuator(i).name
         # An actuator without a name goes by the joint that it moves, where it moves one (type 0).
         if not name and model.actuator_trntype[i] == 0:

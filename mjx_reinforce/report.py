@@ -82,8 +82,9 @@ def _report(settings: ReportSettings) -> None:
 
 def _default_output(chosen: Sequence[Path]) -> Path:
     """Returns where a page goes: into what it is of, or, if that is several, the current folder."""
-    folder = chosen[0] if len(chosen) == 1 else Path()
-    return folder / "report.html"
+    if len(chosen) == 1:
+        return chosen[0] / "report.html"
+    return Path("report.html")
 
 
 def check_page(output: Path, overwrite: bool) -> None:

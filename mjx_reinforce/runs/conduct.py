@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import itertools
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from mjx_reinforce.console.interrupt import Interrupt
@@ -41,11 +41,7 @@ def conduct(
     """
     # No loop below runs for the files of a run that leaves none.
     own_files = [] if files is None else [files]
-    unfinished_groups = []
-    for group_plan in plan.group_plans:
-        chunks = [x for x in group_plan.chunks if not any(file.has(x.name) for file in own_files)]
-        if chunks:
-            unfinished_groups.append(group_plan._replace(chunks=chunks))
+    unfinished_groups = _unfinished(plan.group_plans, own_files)
     screen = display
     if plan.design.is_sweep:
         screen = SweepScreen(display, plan, unfinished_groups)
@@ -53,15 +49,7 @@ def conduct(
     # evaluation that is nowhere on the disk.
     all_observers = [*own_files, screen, *observers]
     clock = plan.clock
-    # A generator compiles when it is first asked. The first chunk is taken from it here, so that
-    # all compiling that nothing runs beside is before the clock is read.
-    compiled_chunks = _compiled(unfinished_groups, clock)
-    compiled_chunks = itertools.chain([*itertools.islice(compiled_chunks, 1)], compiled_chunks)
-    clock.compiling = time.perf_counter() - clock.began
-    # Where others compute beside this, what it computed itself is nearer to a quiet machine's time.
-    quiet_seconds = min(clock.compiling, time.process_time() - clock.computed)
-    if unfinished_groups:
-        keep_seconds(plan.design.configs[0], plan.design.over, quiet_seconds)
+    compiled_chunks = _first_compiled(unfinished_groups, plan)
     # Not before: a kill while it compiles leaves nothing that would refuse the next.
     interrupt.defer(display.say)
     for file in own_files:
@@ -69,24 +57,15 @@ def conduct(
     display.start(clock.compiling)
     driver = None
     for group_plan, runs, compiled in compiled_chunks:
-        # The number of seeds is here that of the chunk's runs, whatever configuration each is of.
-        config = dataclasses.replace(group_plan.group.config, num_seeds=len(runs.seed))
-        settings = {name: values[runs.place] for name, values in group_plan.group.settings.items()}
-        slots = Slots(compiled, runs.seed, settings)
-        if plan.design.is_sweep:
-            driver = Training(config, slots, Record(config), runs, observers=all_observers)
-        else:
-            driver = begin_run(
-                config,
-                group_plan.ready.threshold,
-                slots,
-                runs,
-                plan.checkpoint,
-                actors=plan.actors,
-                say=display.say,
-                observers=all_observers,
-                interrupted=interrupt.heard,
-            )
+        driver = _begin(
+            plan,
+            group_plan,
+            runs,
+            compiled,
+            say=display.say,
+            observers=all_observers,
+            interrupted=interrupt.heard,
+        )
         for observer in all_observers:
             observer.began(driver)
         driver.drive(interrupt.heard)
@@ -106,6 +85,57 @@ def conduct(
     for observer in all_observers:
         observer.finished(driver, summary)
     return driver, summary
+
+
+def _unfinished(group_plans: Sequence[GroupPlan], own_files: Sequence[Files]) -> list[GroupPlan]:
+    """Returns the groups of which some chunks have not ended yet, with these chunks alone."""
+    unfinished_groups = []
+    for group_plan in group_plans:
+        chunks = [x for x in group_plan.chunks if not any(file.has(x.name) for file in own_files)]
+        if chunks:
+            unfinished_groups.append(group_plan._replace(chunks=chunks))
+    return unfinished_groups
+
+
+def _begin(
+    plan: Plan,
+    group_plan: GroupPlan,
+    runs: Runs,
+    compiled: Compiled,
+    *,
+    say: Callable[[str], None],
+    observers: Sequence[Observer[Any]],
+    interrupted: Callable[[], bool],
+) -> Training:
+    """Returns the runs of a chunk before their first update.
+
+    Args:
+      plan: of the run or the sweep.
+      group_plan: of the chunk's group.
+      runs: of the chunk.
+      compiled: the programs of the group.
+      say: shows a line to the user.
+      observers: who sees the runs.
+      interrupted: whether they are to end soon.
+    """
+    group = group_plan.group
+    # The number of seeds is here that of the chunk's runs, whatever configuration each is of.
+    config = dataclasses.replace(group.config, num_seeds=len(runs.seed))
+    settings = {name: values[runs.place] for name, values in group.settings.items()}
+    slots = Slots(compiled, runs.seed, settings)
+    if plan.design.is_sweep:
+        return Training(config, slots, Record(config), runs, observers=observers)
+    return begin_run(
+        config,
+        group_plan.ready.threshold,
+        slots,
+        runs,
+        plan.checkpoint,
+        actors=plan.actors,
+        say=say,
+        observers=observers,
+        interrupted=interrupted,
+    )
 
 
 def _sweep_summary(
@@ -143,6 +173,25 @@ def _compiled(
         tasks = [started(task).result for task in following]
         for runs in group_plan.chunks:
             yield group_plan, runs, compiled
+
+
+def _first_compiled(
+    group_plans: Sequence[GroupPlan], plan: Plan
+) -> Iterator[tuple[GroupPlan, Runs, Compiled]]:
+    """Returns ``_compiled`` of groups, whose first programs are compiled now, before anything runs.
+
+    How long that took is on the plan's clock, and kept for the forecast of later runs.
+    """
+    clock = plan.clock
+    compiled_chunks = _compiled(group_plans, clock)
+    # A generator does nothing before it is asked: the first chunk is taken from it, and put back.
+    compiled_chunks = itertools.chain([*itertools.islice(compiled_chunks, 1)], compiled_chunks)
+    clock.compiling = time.perf_counter() - clock.began
+    # Where others compute beside this, what it computed itself is nearer to a quiet machine's time.
+    quiet_seconds = min(clock.compiling, time.process_time() - clock.computed)
+    if group_plans:
+        keep_seconds(plan.design.configs[0], plan.design.over, quiet_seconds)
+    return compiled_chunks
 
 
 def _compile(group_plan: GroupPlan) -> Compiled:

@@ -64,7 +64,9 @@ class Config(
     @property
     def first_seed(self) -> int:
         """The number of the first seed."""
-        return 0 if self.seeds is None else read_seeds(self.seeds).start
+        if self.seeds is None:
+            return 0
+        return read_seeds(self.seeds).start
 
     @property
     def episodes_per_update(self) -> int:
