@@ -14,8 +14,21 @@ from mjx_reinforce.engine.lazy import homes
 _HOME = homes(__file__)
 #: Folders and files that are attributes too, also imported on first use.
 _MODULES = (
-    *("console", "engine", "envs", "export", "files", "learning", "playing", "published"),
-    *("registry", "reports", "runs", "settings", "setup", "statistics", "training"),
+    "console",
+    "engine",
+    "envs",
+    "export",
+    "files",
+    "learning",
+    "playing",
+    "published",
+    "registry",
+    "reports",
+    "runs",
+    "settings",
+    "setup",
+    "statistics",
+    "training",
 )
 # Checkers read the list in the stub.
 __all__ = sorted([*_HOME, "__version__"])  # pyright: ignore[reportUnsupportedDunderAll]

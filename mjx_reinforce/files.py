@@ -19,18 +19,22 @@ import numpy as np
 from mjx_reinforce.engine.checks import explain
 from mjx_reinforce.engine.memory import gigabytes
 
-#: What arrays may take that are read from an archive: bytes, or how often its own.
-_UNPACKED, _TIMES = 2**26, 32
+#: What arrays may take that are read from an archive (bytes).
+_UNPACKED = 2**26
+#: Or, of a large archive, how often its own size.
+_TIMES = 32
 #: Named arrays, as an archive (.npz) holds them.
 Arrays = dict[str, np.ndarray]
 
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Replaces a file at once: a reader, a crash or a power cut sees the old one or the new one."""
+    # In the same folder: a file system replaces at once only what is its own.
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
         with temporary.open("xb") as file:
             file.write(content)
+            # Else a power cut could leave the new name with nothing in it.
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -42,10 +46,12 @@ def write_bytes(path: Path, content: bytes) -> None:
         _sync(path.parent)
 
 
-def remove_parts(*folders: Path) -> None:
+def remove_leftovers(*folders: Path) -> None:
     """Removes what a crash left of ``write_bytes`` in folders, which need not exist."""
-    for part in (part for folder in folders for part in folder.glob(".*." + 8 * "[0-9a-f]")):
-        part.unlink()
+    for folder in folders:
+        # Eight hexadecimal digits, as ``write_bytes`` ends the name of a temporary file.
+        for leftover in folder.glob(".*." + 8 * "[0-9a-f]"):
+            leftover.unlink()
 
 
 def check_folder(folder: Path) -> None:
@@ -67,18 +73,18 @@ class MovedError(FileNotFoundError):
         )
 
 
-def check_place(directory: Path, known: os.stat_result) -> None:
+def check_place(directory: Path, place: os.stat_result) -> None:
     """Raises MovedError if a directory is not the one it was, though another be in its place.
 
     Args:
       directory: into which files are written.
-      known: what ``stat`` said of it.
+      place: what ``stat`` said of it.
     """
     try:
-        here = os.path.samestat(directory.stat(), known)
+        is_same = os.path.samestat(directory.stat(), place)
     except (FileNotFoundError, NotADirectoryError):
-        here = False
-    if not here:
+        is_same = False
+    if not is_same:
         raise MovedError(directory)
 
 
@@ -102,8 +108,10 @@ def check_module(path: Path, example: str) -> None:
 
     The message has the ``example`` of a better --output.
     """
-    name, taken = path.stem, {"numpy", *sys.stdlib_module_names}
-    if path.suffix != ".py" or not name.isidentifier() or keyword.iskeyword(name) or name in taken:
+    name = path.stem
+    is_module = path.suffix == ".py" and name.isidentifier() and not keyword.iskeyword(name)
+    # Python looks in the folder of a script first: a numpy.py there would be NumPy for all.
+    if not is_module or name in {"numpy", *sys.stdlib_module_names}:
         raise ValueError(
             f"Python cannot import {path.name!r} beside its own modules and NumPy; choose an "
             f"--output of letters, digits and underscores, such as {example}"
@@ -178,6 +186,7 @@ def read_arrays(
     """
     try:
         with path.open("rb") as file:
+            # Before NumPy unpacks anything.
             check_archive(file, names, stored=stored)
             file.seek(0)
             with np.load(file, allow_pickle=False) as archive:
@@ -205,12 +214,16 @@ def check_archive(
       stored: refuse compressed arrays of any size.
     """
     size = archive.seek(0, os.SEEK_END)
-    with zipfile.ZipFile(archive) as opened:
-        parts = opened.infolist()
-    if stored and (packed := [part.filename for part in parts if part.compress_type]):
-        raise ValueError(f"{packed[0]!a} is compressed")
-    wanted = (x for x in parts if names is None or x.filename.removesuffix(".npy") in names)
-    total = sum(part.file_size for part in wanted)
+    with zipfile.ZipFile(archive) as zip_file:
+        members = zip_file.infolist()
+    compressed = [member.filename for member in members if member.compress_type]
+    if stored and compressed:
+        raise ValueError(f"{compressed[0]!a} is compressed")
+    # An array is a member of its name and .npy; sizes are what the archive says of itself, and
+    # unpacking ends with an error beyond them.
+    if names is not None:
+        members = [x for x in members if x.filename.removesuffix(".npy") in names]
+    total = sum(member.file_size for member in members)
     if total > max(_UNPACKED, _TIMES * size):
         raise ValueError(
             f"its arrays take {gigabytes(total)}, too many times the {gigabytes(size)} of the file"
@@ -220,9 +233,10 @@ def check_archive(
 def finite(value: object) -> Any:
     """Returns a value for JSON: numbers that are not finite are None."""
     if isinstance(value, Mapping):
-        return {key: finite(item) for key, item in value.items()}
+        return {key: finite(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
+        return [finite(entry) for entry in value]
+    # NaN compares as false with every number, so that one comparison finds it, too.
     if isinstance(value, float) and not (-float("inf") < value < float("inf")):
         return None
     return value
@@ -243,12 +257,14 @@ def append(path: Path, content: bytes) -> None:
     Raises:
       OSError: it cannot be written, or it is not there, and with it what it held before.
     """
-    left = memoryview(content)
+    unwritten = memoryview(content)
+    # Unbuffered: a buffer would be written when the file is closed, behind the cut below. Such a
+    # write may take a part of the bytes only.
     with path.open("r+b", buffering=0) as file:
         size = file.seek(0, os.SEEK_END)
         try:
-            while left:
-                left = left[file.write(left) :]
+            while unwritten:
+                unwritten = unwritten[file.write(unwritten) :]
         except BaseException:
             file.truncate(size)
             raise

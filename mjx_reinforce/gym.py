@@ -53,8 +53,9 @@ def make(
     Raises:
       ValueError: as of ``make_vec``, or MuJoCo cannot draw here.
     """
+    # First of all: how MuJoCo draws is settled when it is imported.
     if render_mode is not None:
-        import_mujoco()  # how it draws is settled when it is imported
+        import_mujoco()
     from mjx_reinforce.engine.vector.for_gymnasium import GymnasiumVectorEnv  # loads JAX
 
     vec = envs.make_vec(env, num_envs, autoreset=autoreset, **options)

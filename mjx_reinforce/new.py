@@ -61,7 +61,10 @@ def write_class(settings: NewSettings) -> None:
     from mjx_reinforce.envs import models
     from mjx_reinforce.envs.instability import instability
 
-    path = str(xml if xml.parent != Path() else Path.cwd() / xml)
+    path = str(xml)
+    # A file's name alone would mean one of the package's own models.
+    if xml.parent == Path():
+        path = str(Path.cwd() / xml)
     model = models.load_model(path)
     models.to_mjx(model, path)
     write_bytes(output, class_source(model, xml.name, output.stem).encode())
@@ -81,32 +84,49 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
       module: the name of the class's file, without its ending.
     """
     timestep = float(model.opt.timestep)
+    # Actions 25 times a second, as near as whole steps of the simulation come to that.
     frame_skip = max(1, round(0.04 / timestep))
-    moves = int(model.njnt > 0 and model.jnt_type[0] == 0)  # a robot that stands on its own
-    joints = [model.joint(i).name for i in range(moves, model.njnt)]
-    observed = [f"joint({json.dumps(name)}).qpos" for name in joints]
-    if not all(joints):
-        observed = ["qpos[7:]" if moves else "qpos"]
-    observed = ["qpos[2:7]"] * moves + observed + ["qvel"] + ["sensordata"] * (model.nsensor > 0)
-    at_home = bool(model.nkey and model.key_ctrl[0].any())
-    parts = "new_task.txt", "new_walk.txt" if moves else "new_hold.txt"
-    template = "".join(Path(__file__).with_name(part).read_text("utf-8") for part in parts)
+    # A robot that stands on its own has a free joint (type 0) first, whose seven numbers are its
+    # position and its orientation.
+    is_free = bool(model.njnt > 0 and model.jnt_type[0] == 0)
+    joints = [model.joint(i).name for i in range(int(is_free), model.njnt)]
+    observation = []
+    if is_free:
+        # Not where it is on the ground, which should make no difference to a policy.
+        observation.append("qpos[2:7]")
+    if all(joints):
+        observation += [f"joint({json.dumps(name)}).qpos" for name in joints]
+    else:
+        observation.append("qpos[7:]" if is_free else "qpos")
+    observation.append("qvel")
+    if model.nsensor > 0:
+        observation.append("sensordata")
+    has_home = bool(model.nkey and model.key_ctrl[0].any())
+    files = ["new_task.txt", "new_walk.txt" if is_free else "new_hold.txt"]
+    template = "".join(Path(__file__).with_name(file).read_text("utf-8") for file in files)
+    # Five seconds are an episode.
+    num_steps = round(5 / (frame_skip * timestep)) or 1
+    # What a robot without a home or without a free joint needs in these places.
+    fields: dict[str, Any] = {"home": "", "imports": "", "effort": "action", "body": 0, "up": ""}
+    if has_home:
+        fields["home"] = _HOME
+        fields["imports"] = "from mjx_reinforce import Box\n"
+        fields["effort"] = "(action - self.home)"
+    if is_free:
+        fields["body"] = int(model.jnt_bodyid[0])
+        fields["up"] = _up(model)
     return template.format(
         title=_title(module),
         module=module,
         xml=json.dumps(xml),
         frame_skip=frame_skip,
         timestep=timestep,
-        steps=round(5 / (frame_skip * timestep)) or 1,
+        steps=num_steps,
         nv=model.nv,
         pose="self.mj_model.key_qpos[0]" if model.nkey else "self.mj_model.qpos0",
-        observed="".join(f"                data.{part},\n" for part in observed),
+        observed="".join(f"                data.{entry},\n" for entry in observation),
         about="\n".join(_about(model)),
-        home=_HOME if at_home else "",
-        imports="from mjx_reinforce import Box\n" if at_home else "",
-        effort="(action - self.home)" if at_home else "action",
-        body=int(model.jnt_bodyid[0]) if moves else 0,
-        up=_up(model) if moves else "",
+        **fields,
     )
 
 
@@ -129,10 +149,14 @@ def _about(model: "MjModel") -> Iterator[str]:
     """Yields the lines of the class's docstring: what its actions move."""
     for i in range(model.nu):
         low, high = model.actuator_ctrlrange[i]
-        limits = f" in [{low:g}, {high:g}]" if model.actuator_ctrllimited[i] else ""
-        of_joint = model.actuator_trntype[i] == 0
-        moved = model.joint(model.actuator_trnid[i, 0]).name if of_joint else ""
-        name = json.dumps(model.actuator(i).name or moved)
+        limits = ""
+        if model.actuator_ctrllimited[i]:
+            limits = f" in [{low:g}, {high:g}]"
+        name = model.actuator(i).name
+        # An actuator without a name goes by the joint that it moves, where it moves one (type 0).
+        if not name and model.actuator_trntype[i] == 0:
+            name = model.joint(model.actuator_trnid[i, 0]).name
+        name = json.dumps(name)
         yield f"    action[{i}]: actuator {name}{limits}"
 
 

@@ -48,32 +48,47 @@ def simulator(env: "Environment", player: Player, horizon: int) -> Simulator:
       player: the policy.
       horizon: T, the time limit in steps.
     """
-    drawn = player.policy.distribution
-    distribution = drawn._replace(sample=lambda *given: drawn.clip(drawn.sample(*given)))
+    unclipped = player.policy.distribution
+
+    def sample(*inputs: jax.Array) -> jax.Array:
+        return unclipped.clip(unclipped.sample(*inputs))
+
+    # Training draws actions as they come; a policy that is ready plays within the bounds.
+    distribution = unclipped._replace(sample=sample)
     play_step = functools.partial(
         step, env.step, functools.partial(act, player.policy), distribution
     )
 
     @jax.jit
-    def whole(actor, key, episode, deterministic):
+    def play_episode(actor, key, episode, deterministic):
+        """Returns ``qpos`` [nq] of the start, and of T steps ``qpos``, rewards and a mask."""
+
         def advance(carry, noise):
+            """Plays a step; behind the episode's end the state stays as it was."""
             state, alive = carry
             played = play_step(actor, state, noise, alive, deterministic)
             after = hold(alive, played.state, state)
+            # A step out of the finite numbers ends the episode, and its reward is none.
             reward = jnp.where(played.broken, jnp.nan, played.reward)
             return (after, played.alive), (after.pipeline_state.qpos, reward, alive)
 
         start, noise_key = begin(env, jax.random.fold_in(key, episode))
         noises = distribution.noise(noise_key, (horizon,))
-        first = start.pipeline_state.qpos
-        return first, jax.lax.scan(advance, (start, jnp.array(True)), noises)[1]
+        _, steps = jax.lax.scan(advance, (start, jnp.array(True)), noises)
+        return start.pipeline_state.qpos, steps
 
     def play(episode: int, noise: bool) -> Episode:
-        arguments = player.actor, jax.random.key(0), jnp.asarray(episode), jnp.asarray(not noise)
-        first, (qpos, rewards, mask) = jax.device_get(whole(*arguments))
+        """Plays the episode of a number, from this function's one compiled program."""
+        number = jnp.asarray(episode)
+        deterministic = jnp.asarray(not noise)
+        played = play_episode(player.actor, jax.random.key(0), number, deterministic)
+        start_qpos, (qpos, rewards, mask) = jax.device_get(played)
         rewards = rewards[mask]
-        shown = qpos[mask][: len(rewards) - bool(np.isnan(rewards[-1]))]
-        return Episode(np.concatenate([first[None], shown]), rewards)
+        qpos = qpos[mask]
+        # The last pose of a broken episode cannot be drawn.
+        if np.isnan(rewards[-1]):
+            qpos = qpos[:-1]
+        return Episode(np.concatenate([start_qpos[None], qpos]), rewards)
 
     return play
 
@@ -92,9 +107,13 @@ def mujoco_simulator(env: "Environment", player: Player, horizon: int) -> Simula
     simulation = InMujoco(env)
 
     def play(episode: int, noise: bool) -> Episode:
+        """Plays the episode of a number, from the start that it has in our simulation, too."""
         rng = np.random.default_rng(episode) if noise else None
-        observation, ended = simulation.reset(_start_key(episode)), False
-        qpos, rewards = [simulation.data.qpos.copy()], []
+        observation = simulation.reset(_start_key(episode))
+        ended = False
+        # Copies: MuJoCo writes every step into the same array.
+        qpos = [simulation.data.qpos.copy()]
+        rewards = []
         while not ended and len(rewards) < horizon:
             observation, reward, ended = simulation.step(np.asarray(player.act(observation, rng)))
             if not (np.isfinite(observation).all() and np.isfinite(reward)):

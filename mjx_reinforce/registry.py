@@ -84,10 +84,10 @@ def is_own(name: str) -> bool:
     return ":" in name
 
 
-def check_choice(kind: str, name: str, known: Mapping[str, Any]) -> None:
-    """Raises ValueError for what is neither a known name nor of the form module:name."""
+def check_choice(kind: str, name: str, choices: Mapping[str, Any]) -> None:
+    """Raises ValueError for what is neither one of the choices nor of the form module:name."""
     if not is_own(name):
-        check_name(kind, name, known)
+        check_name(kind, name, choices)
     elif not re.fullmatch(r"\w+(\.\w+)*:\w+", name):
         raise ValueError(
             f"the {kind} {name!r} is not of the form module:name, such as mine:make for the "
@@ -95,14 +95,16 @@ def check_choice(kind: str, name: str, known: Mapping[str, Any]) -> None:
         )
 
 
-def load_choice(kind: str, name: str, known: Mapping[str, Any]) -> Callable[..., Any]:
-    """Returns the definition of a known name, or the user's own by module:name.
+def load_choice(kind: str, name: str, choices: Mapping[str, Any]) -> Callable[..., Any]:
+    """Returns the definition of one of the choices, or the user's own by module:name.
 
     Raises:
       ValueError: as ``check_choice`` and ``load_own``.
     """
-    check_choice(kind, name, known)
-    return load_own(kind, name) if is_own(name) else load_definition(known[name])
+    check_choice(kind, name, choices)
+    if is_own(name):
+        return load_own(kind, name)
+    return load_definition(choices[name])
 
 
 def load_own(kind: str, name: str, *, form: str = "module:name") -> Callable[..., Any]:
@@ -116,21 +118,23 @@ def load_own(kind: str, name: str, *, form: str = "module:name") -> Callable[...
     Raises:
       ValueError: it cannot be imported, or is not a class or function.
     """
-    if not {"", os.getcwd()} & set(sys.path):  # python -m has it, a script has not
+    # ``python -m`` looks in the current folder, and the script mjx-reinforce does not.
+    if not {"", os.getcwd()} & set(sys.path):
         sys.path.insert(0, os.getcwd())
+    # An import runs the user's code, which may raise anything.
     try:
-        made = load_definition(name)
-    except (Exception, SystemExit) as error:  # an import runs the user's code
+        definition = load_definition(name)
+    except (Exception, SystemExit) as error:
         raise ValueError(
             f"cannot import the {kind} {name!r}: {explain(error)}; write {form} of a module that "
             "is in this folder or installed"
         ) from error
-    if not callable(made):
+    if not callable(definition):
         raise ValueError(
-            f"the {kind} {name!r} is not a class or function, but of type {type(made).__name__}; "
-            f"write {form}"
+            f"the {kind} {name!r} is not a class or function, but of type "
+            f"{type(definition).__name__}; write {form}"
         )
-    return made
+    return definition
 
 
 def load_definition(entry: str | Callable[..., Any]) -> Callable[..., Any]:

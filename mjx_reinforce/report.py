@@ -58,25 +58,33 @@ def _report(settings: ReportSettings) -> None:
     if settings.output is not None:
         check_page(settings.output, settings.overwrite)
     # A folder of runs, as in hopper/*, may have pages about them, too.
+    # If all of them are pages they stay, for the message that none is a run.
     chosen = [path for path in settings.sources if not _is_report(path)] or settings.sources
-    if pages := [str(path) for path in settings.sources if path not in chosen]:
+    pages = [str(path) for path in settings.sources if path not in chosen]
+    if pages:
         print(f"left out, for they are reports: {', '.join(pages)}")
     experiment = sources.read_experiment(chosen)
+    # Where the page goes by default is known only now; a place that the user names was checked
+    # above, before the sources were read.
     output = settings.output or _default_output(chosen)
     check_page(output, settings.overwrite)
     try:
         seconds = _write(experiment, output).seconds
     except OSError as error:
-        gone = f"{output.parent} was moved or removed"
-        say_error(f"cannot write {output}: {error if output.parent.is_dir() else gone}")
+        reason = str(error)
+        if not output.parent.is_dir():
+            reason = f"{output.parent} was moved or removed"
+        say_error(f"cannot write {output}: {reason}")
         sys.exit(1)
-    took = f"{output.stat().st_size / 1e6:.1f} MB, {seconds:.1f} s"
-    print(f"{output} ({took}), pictures and tables in {_beside(output)}")
+    size = f"{output.stat().st_size / 1e6:.1f} MB, {seconds:.1f} s"
+    print(f"{output} ({size}), pictures and tables in {_beside(output)}")
 
 
 def _default_output(chosen: Sequence[Path]) -> Path:
     """Returns where a page goes: into what it is of, or, if that is several, the current folder."""
-    return (chosen[0] if len(chosen) == 1 else Path()) / "report.html"
+    if len(chosen) == 1:
+        return chosen[0] / "report.html"
+    return Path("report.html")
 
 
 def check_page(output: Path, overwrite: bool) -> None:
@@ -119,22 +127,27 @@ def write_report(chosen: Sequence[Path], output: Path) -> WrittenReport:
 
 
 def _write(experiment: Experiment, output: Path) -> WrittenReport:
-    started = time.perf_counter()
+    """Writes the page of an experiment; see ``write_report``."""
+    start = time.perf_counter()
     findings = compute_findings(experiment)
-    drawn, labels, beside = document.draw_charts(findings), findings.labels, _beside(output)
+    charts = document.draw_charts(findings)
+    labels = findings.labels
+    beside = _beside(output)
     beside.mkdir(exist_ok=True)
     results = results_csv(findings)
     write_bytes(beside / "results.csv", encoded(results))
-    for chart in drawn:
+    for chart in charts:
         for name, table in chart.data.items():
             write_bytes(beside / f"{name}.csv", encoded(table_csv(table, labels)))
         for ending, picture in render_chart(chart, labels, experiment.title).items():
             write_bytes(beside / f"{chart.name}.{ending}", picture)
-    seconds = time.perf_counter() - started
-    watch, ours = how_to_watch(experiment, findings), version("mjx-reinforce") or "not installed"
-    text = document.render(findings, drawn, results, watch, ours, seconds)
+    # The page is last, so that all that it links to is there; its own time it cannot say.
+    seconds = time.perf_counter() - start
+    watch = how_to_watch(experiment, findings)
+    package_version = version("mjx-reinforce") or "not installed"
+    text = document.render(findings, charts, results, watch, package_version, seconds)
     write_bytes(output, encoded(text))
-    return WrittenReport(time.perf_counter() - started, words.headline(findings), findings.order[0])
+    return WrittenReport(time.perf_counter() - start, words.headline(findings), findings.order[0])
 
 
 def _beside(output: Path) -> Path:
@@ -158,15 +171,21 @@ def results_csv(findings: Findings) -> str:
     names = swept(findings)
     header = ("configuration", *names, "seed", "final_return", "best_return")
     lines: list[Sequence[Any]] = [(*header, "env_steps_to_solve", "env_steps", "nonfinite")]
-    for place, result in enumerate(findings.results):
-        part, solving = result.configuration, result.solving
-        settings = [say(part.settings.get(name)) for name in names]
-        best = short(np.fmax.reduce(part.eval_return, axis=0), 7)
-        final, end = short(result.final, 7), part.env_steps[-1].tolist()
-        for s, seed in enumerate(part.seed.tolist()):
+    # Configurations are numbered from 1, the best one first, as on the page.
+    for number, result in enumerate(findings.results, start=1):
+        configuration = result.configuration
+        solving = result.solving
+        settings = [say(configuration.settings.get(name)) for name in names]
+        # A seed's evaluations that were not finite are passed over.
+        best = short(np.fmax.reduce(configuration.eval_return, axis=0), 7)
+        final = short(result.final, 7)
+        env_steps = configuration.env_steps[-1].tolist()
+        for s, seed in enumerate(configuration.seed.tolist()):
+            # Empty for a seed that never solved the task, and where nothing counts as solved.
             solved = int(solving.steps[s]) if solving and solving.solved[s] else ""
-            values = (seed, final[s], best[s], solved, end[s], int(part.nonfinite[s]))
-            lines.append((place + 1, *settings, *values))
+            nonfinite = int(configuration.nonfinite[s])
+            values = (seed, final[s], best[s], solved, env_steps[s], nonfinite)
+            lines.append((number, *settings, *values))
     return csv_text(lines)
 
 
@@ -179,16 +198,19 @@ def how_to_watch(experiment: Experiment, findings: Findings) -> str:
     """Returns the command that shows the best configuration's worst seed, "" if none was kept."""
     best = findings.results[0]
     worst = worst_seeds(best)[0]
-    seed, place = int(best.configuration.seed[worst]), best.configuration.where[worst]
-    if not (place / "config.json").is_file():  # a sweep
-        first = experiment.directories[findings.order[0]]
-        number = findings.order[0] - experiment.directories.index(first)
+    seed = int(best.configuration.seed[worst])
+    place = best.configuration.where[worst]
+    # The directory of a sweep has no config.json, and a folder of policies for each configuration,
+    # counted within the sweep: it may be one of several sources.
+    if not (place / "config.json").is_file():
+        sweep = experiment.directories[findings.order[0]]
+        number = findings.order[0] - experiment.directories.index(sweep)
         place = place / "policies" / f"{number:03d}"
+        # A sweep keeps the policies of each configuration's worst and best seed alone.
         if seed not in seeds_in(place):
             return ""
-    own = code_flags({"env": experiment.env})
-    run = f"{shlex.quote(str(place))} --seed {seed}{own}"
-    return f"python -m mjx_reinforce.watch {run}"
+    flags = code_flags({"env": experiment.env})
+    return f"python -m mjx_reinforce.watch {shlex.quote(str(place))} --seed {seed}{flags}"
 
 
 if __name__ == "__main__":

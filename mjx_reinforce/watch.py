@@ -76,6 +76,7 @@ def film(settings: WatchSettings) -> None:
       ValueError: a setting is out of range, or the run is damaged, or nothing can be drawn here.
       OSError: a file cannot be read or written.
     """
+    # All that can be wrong is checked first, for JAX takes seconds to load.
     run = read_run(choose_run(settings.run))
     if settings.env not in (None, run.env):
         raise ValueError(f"--env is {settings.env}, but {run.directory} was trained on {run.env}")
@@ -91,7 +92,8 @@ def film(settings: WatchSettings) -> None:
     if settings.beside is not None:
         players = {"before training": untrained(player), "after training": player}
     env = envs.make_set(run.env, run.env_set)
-    model, takes = scene(env), []
+    model = scene(env)
+    takes = []
     for label, player in players.items():
         name, play = simulator(env, player, run.horizon)
         with Console(stderr=True).status("compiling and playing"):
@@ -99,12 +101,17 @@ def film(settings: WatchSettings) -> None:
         print(f"{label}: return {episode.total:.1f} in {len(episode.rewards)} steps in {name}")
         takes.append(Take(label, model, _within(env, "dt").dt, *episode))
     shown = side_by_side(takes, settings.width, settings.height, seconds=settings.seconds)
+    # A GIF has 256 colors: a few frames, drawn before, decide which.
     samples = [*map(shown.draw, shown.samples)]
     frames = map(shown.draw, track(range(shown.length), "drawing", transient=True))
     write_bytes(output, gif(frames, shown.rate, samples))
-    lasting = max((len(take.qpos) - 1) * take.dt for take in takes)
-    cut = f": {settings.seconds:g} of {lasting:g} s; --seconds {lasting:g} shows all"
-    print(f"{shown.length} frames in {output}{cut * (settings.seconds < lasting)}")
+    # ``qpos`` has a row more than there are steps: the start's.
+    episode_seconds = max((len(take.qpos) - 1) * take.dt for take in takes)
+    text = f"{shown.length} frames in {output}"
+    if settings.seconds < episode_seconds:
+        text += f": {settings.seconds:g} of {episode_seconds:g} s; "
+        text += f"--seconds {episode_seconds:g} shows all"
+    print(text)
 
 
 def choose_run(directory: Path) -> Path:
@@ -116,6 +123,7 @@ def choose_run(directory: Path) -> Path:
     if (directory / "config.json").exists():
         return directory
     policies = [x for x in directory.glob("*/policy") if (x.parent / "config.json").exists()]
+    # By the time of the policies: that of a directory changes with every video in it.
     if policies:
         return max(policies, key=lambda policy: policy.stat().st_mtime).parent
     if directory == RUNS:
@@ -156,6 +164,7 @@ def untrained(player: "Player") -> "Player":
     from mjx_reinforce.learning import normalize
     from mjx_reinforce.learning.policy import Actor
 
+    # Not the seed's own initial parameters, whose key depends on the settings of the run.
     params = player.policy.init(jax.random.key(player.seed))
     actor = Actor(params=params, normalizer=normalize.init(player.observation_size))
     return player._replace(actor=actor)
@@ -184,6 +193,7 @@ def scene(env: Any) -> Any:
       ValueError: it has none.
     """
     env = _within(env, "mj_model")
+    # The file, where there is one, and not the compiled model, to which no sky can be added.
     settings = getattr(env, "settings", None)
     xml_file = getattr(env, "scene", None) or getattr(settings, "xml_file", None)
     if xml_file is not None and not hasattr(xml_file, "nbody"):  # no compiled model

@@ -124,7 +124,7 @@ def test_a_compressed_part_of_a_sweep_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(SweepFiles, "_contents", lambda self: {})
     (tmp_path / "parts").mkdir()
     np.savez_compressed(tmp_path / "parts" / "000.npz", seed=np.zeros(2))
-    written = SweepFiles(tmp_path, type("Prepared", (), {"known": {}}), print)
+    written = SweepFiles(tmp_path, type("Plan", (), {"saved_record": {}}), print)
     with pytest.raises(ValueError, match=r"000\.npz is damaged: .*'seed\.npy' is compressed"):
         written.finished(None, {"status": "interrupted"})
 

@@ -30,13 +30,17 @@ def command(name: str) -> str:
 
 def typed(name: str) -> str:
     """Returns the command line of this process, whose command it is, to be typed again."""
-    return f"{command(name)} {shlex.join(sys.argv[1:])}" if _by_script() else shlex.join(sys.argv)
+    # With ``python -m`` the first word is the path of the module, which says which program ran.
+    if not _by_script():
+        return shlex.join(sys.argv)
+    return f"{command(name)} {shlex.join(sys.argv[1:])}"
 
 
 def _by_script() -> bool:
     """Returns whether the script took the name of the command from the command line."""
-    called = Path(sys.argv[0])
-    return called.stem == SCRIPT or called.parts[-2:] == ("mjx_reinforce", "__main__.py")
+    program = Path(sys.argv[0])
+    # ``python -m mjx_reinforce train`` is another way to call the script.
+    return program.stem == SCRIPT or program.parts[-2:] == ("mjx_reinforce", "__main__.py")
 
 
 def menu(version: str) -> str:

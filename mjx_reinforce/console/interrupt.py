@@ -31,9 +31,12 @@ class Interrupt:
         self._screen_actions: list[Callable[[], Any]] = [sys.stdout.flush, sys.stderr.flush]
 
     def __enter__(self) -> "Interrupt":
-        self._heard, self._told = socket.socketpair()
-        self._told.setblocking(False)
-        self._descriptor = signal.set_wakeup_fd(self._told.fileno(), warn_on_full_buffer=False)
+        """Starts listening, until ``__exit__``."""
+        # Python's own C handler, which runs at once in whatever thread, writes a signal's number
+        # into the socket. It must not wait there: the reader may be what it has interrupted.
+        self._receiver, self._sender = socket.socketpair()
+        self._sender.setblocking(False)
+        self._descriptor = signal.set_wakeup_fd(self._sender.fileno(), warn_on_full_buffer=False)
         numbers = [signal.SIGINT, signal.SIGTERM]
         if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
             numbers.append(signal.SIGHUP)
@@ -42,11 +45,15 @@ class Interrupt:
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Stops listening; signals do what they did before, or nothing once one has asked."""
         for number, handler in self._handlers.items():
-            # Python's handlers would change the exit status.
-            signal.signal(number, handler if self.number is None else signal.SIG_IGN)
+            # Python's handlers would change the exit status that the first signal asked for.
+            if self.number is not None:
+                handler = signal.SIG_IGN
+            signal.signal(number, handler)
         signal.set_wakeup_fd(self._descriptor)
-        self._told.close()  # which ends the thread
+        # The thread reads the end of the stream, and ends.
+        self._sender.close()
 
     def heard(self) -> bool:
         """Returns whether a signal asks the run to stop."""
@@ -85,27 +92,34 @@ class Interrupt:
           say: tells the user why, once the screen is as it was.
         """
         _try(self._actions)
-        last = self._screen_actions + ([] if say is None else [say])
+        screen_actions = [*self._screen_actions]
+        if say is not None:
+            screen_actions.append(say)
         # Not for long: the screen may be a pipe that nobody reads.
-        _start_thread(functools.partial(_try, last)).join(timeout=1)
+        _start_thread(functools.partial(_try, screen_actions)).join(timeout=1)
         os._exit(status)
 
     def _listen(self) -> None:
-        with self._heard:
-            while heard := self._heard.recv(1):
-                if heard[0] in self._handlers:
-                    self._act(heard[0])
+        with self._receiver:
+            while byte := self._receiver.recv(1):
+                # Python writes other signals there, too, such as those of a user's own handlers.
+                if byte[0] in self._handlers:
+                    self._act(byte[0])
 
     def _act(self, number: int) -> None:
+        """Does what a signal asks for: the end of the process, now or after the present block."""
         if self._say is None:
             self.leave(128 + number, _say_unbegun)
         if self.number is not None:
+            # The shell and the kernel send one each when a terminal ends.
             if number == signal.SIGHUP:
-                return  # the shell and the kernel send one each when a terminal ends
+                return
             self.leave(128 + number)
         self.number = number
-        said = "stopping after the current block of updates or test; Ctrl-C again stops at once"
-        _start_thread(functools.partial(self._say, said))
+        text = "stopping after the current block of updates or test; Ctrl-C again stops at once"
+        # In a thread of its own, for a screen that takes nothing must not keep this one from
+        # hearing the second signal.
+        _start_thread(functools.partial(self._say, text))
 
 
 def _try(actions: Iterable[Callable[[], Any]]) -> None:
@@ -122,8 +136,11 @@ def _start_thread(action: Callable[[], Any]) -> threading.Thread:
 
 def _say_unbegun() -> None:
     """Says that there is no run; on a terminal below the bar, on whose line the cursor stands."""
-    said = "stopped before training began; nothing was written"
-    print("\n" * sys.stderr.isatty() + said, file=sys.__stderr__, flush=True)
+    text = "stopped before training began; nothing was written"
+    if sys.stderr.isatty():
+        text = f"\n{text}"
+    # Not to ``sys.stderr``, which rich replaces while it draws.
+    print(text, file=sys.__stderr__, flush=True)
 
 
 def _nothing(number: int, frame: object) -> None:

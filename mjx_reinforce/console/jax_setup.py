@@ -27,18 +27,20 @@ def configure_jax() -> None:
     import jax
 
     settings = jax.config.values
-    for name, what in _REFUSED.items():
+    for name, reason in _REFUSED.items():
         if settings[name.lower()] not in _HARMLESS:
-            raise ValueError(f"{name} is set, but {what}; unset it")
+            raise ValueError(f"{name} is set, but {reason}; unset it")
     if settings["jax_enable_compilation_cache"]:
         _choose_cache()
     if settings["jax_default_matmul_precision"] is None:
         jax.config.update("jax_default_matmul_precision", "highest")
+    # JAX looks for devices when it is first asked, which would else be deep in a program.
     try:
         jax.devices()
     except RuntimeError as error:
         raise ValueError(f"JAX cannot compute here: {error}") from error
-    except AssertionError as error:  # JAX knows the platform, but has no plugin for it
+    # That is what JAX raises for a platform that it knows and has no plugin for.
+    except AssertionError as error:
         raise ValueError(
             f"JAX cannot compute here: JAX_PLATFORMS is {settings['jax_platforms']!r}, for which "
             "no plugin is installed; install JAX for it (pip install 'jax[cuda12]'), or unset it"
@@ -53,19 +55,23 @@ def _choose_cache() -> None:
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 
-    variable, chosen = "JAX_COMPILATION_CACHE_DIR", jax.config.values["jax_compilation_cache_dir"]
+    variable = "JAX_COMPILATION_CACHE_DIR"
+    chosen = jax.config.values["jax_compilation_cache_dir"]
     if chosen is None:
         variable = "XDG_CACHE_HOME"
         cache = os.environ.get(variable) or os.path.expanduser("~/.cache")
         chosen = os.path.join(cache, "mjx_reinforce")
+        # JAX keeps by default what took a second or more; a run has many programs that take less.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    # A cache with :// is a bucket in a cloud, of which no folder is checked.
     if chosen and "://" not in chosen and (why := _unusable(Path(chosen))):
         warn(
             f"the cache {chosen} is not used ({why}), so the next start compiles again; set "
             f"{variable} to a folder of your own"
         )
         chosen = None
-        compilation_cache.reset_cache()  # a module of the user's may have used it
+        # A module of the user's may have compiled before this, and so have opened the cache.
+        compilation_cache.reset_cache()
     elif chosen and "://" not in chosen and not os.access(chosen, os.W_OK):
         warn(
             f"nothing can be kept in the cache {chosen} (it cannot be written), so the next start "

@@ -27,17 +27,18 @@ def accept_everything() -> None:
     """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
+        # Python has None for a stream that was not open, and every print would fail.
         if stream is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (stays open)
         elif type(stream) is io.TextIOWrapper:
             raw = _Lossy(stream.fileno(), "w", closefd=False)
-            made = io.TextIOWrapper(
+            lossy_stream = io.TextIOWrapper(
                 io.BufferedWriter(raw),
                 stream.encoding,
                 "backslashreplace",
                 line_buffering=stream.line_buffering or stream.write_through,
             )
-            setattr(sys, name, made)
+            setattr(sys, name, lossy_stream)
         elif isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
 

@@ -238,11 +238,8 @@ def _checksum(settings: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:
 def build_policy(settings: dict[str, Any]) -> Policy:
     """Returns the policy that ``settings`` of ``save_policy`` describe.
 
-    What an older file does not say is as it was then: orthogonal weights, and means scaled to the
-    action's range.
+    Where they do not say it, weights begin orthogonal, and means are scaled to the action's range.
     """
-    if not settings.get("shared_trunk", True):
-        raise ValueError("a second network for standard deviations is of an earlier version")
     family = settings["policy"]
     make = load_choice("policy", family, DISTRIBUTIONS)
     arguments = {k: settings.get(k, default) for k, default in _FAMILY_ARGUMENTS.items()}

@@ -26,7 +26,7 @@ from mjx_reinforce.reports.experiment import (
 #: What config.json says besides the settings.
 PROVENANCE = (
     *("python", "packages", "git_commit", "device", "cpu", "machine_code", "jax_settings"),
-    *("num_devices", "num_processes", "cpu_count", "cores", "x64", "xla_flags", "resumed"),
+    *("num_devices", "cpu_count", "cores", "x64", "xla_flags", "resumed"),
 )
 #: What sweep.json says of the sweep itself; all else is its provenance.
 _OWN = (
@@ -236,8 +236,8 @@ def _read_run(directory: Path, config: dict[str, Any]) -> Source:
     summary: dict[str, Any] = read_json(path) if path.exists() else {"status": "running"}
     num_seeds = len(columns["seed"])
     with naming_damage(path):
-        # Early versions wrote an empty list where all was finite.
-        counts = np.array(summary.get("nonfinite") or 0, np.int64)
+        # A run that goes on has no counts yet.
+        counts = np.array(summary.get("nonfinite", 0), np.int64)
         nonfinite = np.broadcast_to(counts, num_seeds)
         outcome = _outcome(summary)
     where = [directory] * num_seeds

@@ -3,13 +3,12 @@
 import dataclasses
 import gc
 import os
-import shlex
 import sys
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import NoReturn
 
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
@@ -17,7 +16,7 @@ from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.streams import accept_everything, say_error, silence_alarms
 from mjx_reinforce.files import MovedError
 from mjx_reinforce.runs.design import Design, SweepSettings, check_swept, read_design, read_over
-from mjx_reinforce.runs.perform import Outcome, locked, perform
+from mjx_reinforce.runs.perform import perform, report_on
 from mjx_reinforce.settings.config import (
     CODE,
     Config,
@@ -30,10 +29,6 @@ from mjx_reinforce.settings.defaults import PRESETS, flag_value, for_arguments, 
 from mjx_reinforce.settings.flags import about_word, cannot_load, read_command_line
 from mjx_reinforce.settings.groups import GROUPS
 from mjx_reinforce.training import resume
-
-if TYPE_CHECKING:
-    from mjx_reinforce.report import WrittenReport
-
 
 _TRAIN = (
     "Train policies by REINFORCE on MuJoCo, many seeds at once, and report over the seeds. Writes "
@@ -80,29 +75,34 @@ def parse(arguments: Sequence[str], name: str = "train") -> Design:
         over = read_over(sweep.over)
         if name == "sweep":
             check_swept(over)
-        more = {"exact": sweep.exact, "chunk_runs": sweep.chunk_runs}
-        return Design(base=base, default=default, over=over, **more)
-    known = read_design(base.resume)
-    directory, own = base.resume, known.base
-    base, sweep = _read(name, flags, own, prog)
+        return Design(
+            base=base, default=default, over=over, exact=sweep.exact, chunk_runs=sweep.chunk_runs
+        )
+    directory = base.resume
+    design = read_design(directory)
+    # The flags are read again, now with the saved settings as defaults: a setting that no flag
+    # names must stay as it is, and the comparison below sees only what the user changes.
+    base, sweep = _read(name, flags, design.base, prog)
     over = read_over(sweep.over)
-    as_before = over in ({}, known.over) and sweep == SweepSettings(over=sweep.over)
-    if not as_before or (known.over and base != own):
+    # A sweep may be named by its --over again, which is how its user confirms code of their own.
+    as_before = over in ({}, design.over) and sweep == SweepSettings(over=sweep.over)
+    if not as_before or (design.is_sweep and base != design.base):
         raise ValueError(f"what is in {directory} goes on as it is: give --resume alone")
-    if not over and any(is_own(x) for name in CODE for x in known.over.get(name, ())):
+    if not over and any(is_own(x) for name in CODE for x in design.over.get(name, ())):
         raise ValueError(
             f"{directory} compares code of your own, and this would run that code; if you trust "
             "it, repeat the sweep's --over"
         )
-    resume.check_settings(own, base)
-    if not known.over and resume.is_done(own, base):
+    resume.check_settings(design.base, base)
+    # A finished sweep may still lack its report, so ``perform`` is to look at that.
+    if not design.is_sweep and resume.is_done(design.base, base):
         print(
             f"{directory} is finished; to go on, give a larger --env-steps or --max-updates, or "
             "--minutes"
         )
         sys.exit(0)
-    check_named(vars(own), named_code(arguments), directory)
-    return dataclasses.replace(known, base=base, default=own)
+    check_named(vars(design.base), named_code(arguments), directory)
+    return dataclasses.replace(design, base=base, default=design.base)
 
 
 def start(arguments: Sequence[str], prog: str) -> tuple[Config, Sequence[str], str]:
@@ -136,9 +136,10 @@ def _default(arguments: Sequence[str]) -> Config:
     directory = Path(os.path.expanduser(like))
     if not (directory / "config.json").is_file():
         raise ValueError(f"--like {like}: there is no run, for it has no config.json")
-    known = read_design(directory).base
-    check_named(vars(known), named_code(arguments), directory)
-    return dataclasses.replace(known, resume=None)
+    config = read_design(directory).base
+    check_named(vars(config), named_code(arguments), directory)
+    # ``read_design`` prepares for going on in that directory; this run only takes its settings.
+    return dataclasses.replace(config, resume=None)
 
 
 def _read(
@@ -159,22 +160,25 @@ def _read(
         how many seeds there are.
     """
     about, groups = _PROGRAMS[name]
-    known = vars(default)
-    forms = [
-        (title, group, group(**{f.name: known[f.name] for f in fields(group) if f.name in known}))
-        for title, group in groups.items()
-    ]
+    defaults = vars(default)
+    # A dataclass of dataclasses, one a group, whose titles become the headings of --help. The
+    # fields of ``SweepSettings`` are not in a ``Config`` and keep their own defaults.
+    forms = []
+    for title, group in groups.items():
+        names = [field.name for field in fields(group) if field.name in defaults]
+        forms.append((title, group, group(**{name: defaults[name] for name in names})))
     form = dataclasses.make_dataclass("Arguments", forms, frozen=True)
     parsed = vars(read_command_line(form, arguments, prog, f"{about}\n\n{_names()}"))
-    found = {name: x for group in parsed.values() for name, x in vars(group).items()}
-    config = Config(**{name: found.pop(name) for name in known})
+    values = {name: x for group in parsed.values() for name, x in vars(group).items()}
+    # What is left over after this are the settings of the sweep, if it is one.
+    config = Config(**{name: values.pop(name) for name in defaults})
     if config.seeds is not None:
         if flag_value(arguments, "--num-seeds"):
             raise ValueError(
                 f"--seeds {config.seeds} says how many seeds there are: leave --num-seeds out"
             )
         config = dataclasses.replace(config, num_seeds=len(read_seeds(config.seeds)))
-    return config, SweepSettings(**found)
+    return config, SweepSettings(**values)
 
 
 def _names() -> str:
@@ -228,16 +232,19 @@ def _train(name: str, interrupt: Interrupt) -> int:
     except ImportError as error:
         refuse(cannot_load(error))
     except ValueError as error:
+        # The innermost frame tells who raised: this package refuses bad input by ValueError, but
+        # one from a library, once training began, is a mistake of this program.
         *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-        ours = frame.f_globals.get("__name__", "").startswith("mjx_reinforce")
-        if outcome is None and interrupt.deferred() and not ours:
-            raise  # of a library, in training: it is a mistake of this program
+        in_package = frame.f_globals.get("__name__", "").startswith("mjx_reinforce")
+        if outcome is None and interrupt.deferred() and not in_package:
+            raise
         refuse(str(error))
     except (RuntimeError, MemoryError, OSError) as error:
         _refuse_full(error, design)
     if outcome.summary["status"] != "interrupted" or interrupt.number is None:
         return int(outcome.summary["status"] == "stopped")
-    if design.over:  # not at the end of a compiler's thread
+    if design.is_sweep:
+        # The next group may still compile in a thread, whose end an ordinary exit would await.
         interrupt.leave(128 + interrupt.number)
     return 128 + interrupt.number
 
@@ -251,67 +258,27 @@ def _refuse_full(error: RuntimeError | MemoryError | OSError, design: Design) ->
         missing = isinstance(error, FileNotFoundError) and not design.directory.is_dir()
         if missing or isinstance(error, MovedError):
             refuse(str(MovedError(design.directory)), status=1)
-        what, again = "sweep" if design.over else "run", "try again"
+        remedy = "try again"
         if any((design.directory / name).exists() for name in resume.BEGUN):
-            again = f"go on with --resume {design.directory}{code_flags(vars(design.base))}"
-        room = "make room, then" if error.errno else "then"  # W&B's have no number
-        refuse(f"cannot write the files of this {what} ({error}); {room} {again}", status=1)
+            remedy = f"go on with --resume {design.directory}{code_flags(vars(design.base))}"
+        # Errors of W&B have no number, and more room would not help.
+        room = "make room, then" if error.errno else "then"
+        files = f"the files of this {design.kind}"
+        refuse(f"cannot write {files} ({error}); {room} {remedy}", status=1)
+    # JAX reports a full device as a RuntimeError with this status in its text.
     if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
         raise error
-    part, flag = ("a chunk", "--chunk-runs") if design.over else ("this run", "--num-seeds")
+    if design.is_sweep:
+        subject = "a chunk"
+        flag = "--chunk-runs"
+    else:
+        subject = "this run"
+        flag = "--num-seeds"
     flags = f"{flag}, --num-episodes, --eval-episodes or --horizon"
-    refuse(f"{part} does not fit into memory ({error}); lower {flags}")
+    refuse(f"{subject} does not fit into memory ({error}); lower {flags}")
 
 
 def refuse(message: str, status: int = 2) -> NoReturn:
     """Says in one line what is wrong, and exits."""
     say_error(message)
     sys.exit(status)
-
-
-def report_on(outcome: Outcome, *, report: bool = True) -> None:
-    """Says what a run or a sweep found, whose report is written, if that is asked for."""
-    display, directory, summary = outcome.display, outcome.directory, outcome.summary
-    assert directory is not None
-    if "over" not in summary:
-        config = vars(outcome.driver.config) if outcome.driver else {}
-        own = {name: config[name] for name in ("env", "policy") if name in config}
-        display.show_summary(summary, directory, code_flags(config), code_flags(own))
-        return
-    if summary["status"] == "interrupted":
-        flags = code_flags(summary["settings"])
-        display.say(f"interrupted; go on with --resume {directory}{flags}")
-        return
-    if outcome.driver is None and (directory / "report.html").exists():
-        display.say(f"the sweep in {directory} is finished")
-        return
-    took = (
-        f"compiling took {summary['compile_seconds']:.1f} s, training and evaluating "
-        f"{summary['run_seconds']:.1f} s"
-    )
-    if not report:
-        display.say(f"{took}. Files in {directory}")
-        return
-    display.say("writing the report")
-    with locked(directory):
-        written = _report(directory)
-    took += f", statistics and report {written.seconds:.1f} s"
-    for sentence in (*written.answer, f"{took}. Files in {directory}, first report.html"):
-        display.say(sentence)
-    display.show_commands(_watch(directory, written.best, summary["settings"]))
-
-
-def _report(directory: Path) -> "WrittenReport":
-    """Writes the report of a sweep; removes what a crash left of writing it."""
-    from mjx_reinforce import report
-
-    for part in [*directory.glob(".report.html.*"), *(directory / "report").glob(".*")]:
-        part.unlink()
-    return report.write_report([directory], directory / "report.html")
-
-
-def _watch(directory: Path, number: int, settings: Mapping[str, Any]) -> dict[str, str]:
-    """Returns the command that plays the best policy of a configuration, after what it does."""
-    place = shlex.quote(str(directory / "policies" / f"{number:03d}"))
-    named = code_flags({name: settings[name] for name in ("env", "policy")})
-    return {"To see the best of it play": f"{command('watch')} {place}{named}"}

@@ -4,12 +4,12 @@ import dataclasses
 import functools
 import itertools
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.runs.display import Display, SweepScreen
-from mjx_reinforce.runs.plan import Part, Prepared
+from mjx_reinforce.runs.plan import GroupPlan, Plan
 from mjx_reinforce.runs.saving import Files
 from mjx_reinforce.setup.compile_times import keep_seconds
 from mjx_reinforce.training.driver import Driver, Observer, Runs, Training, begin_run
@@ -18,7 +18,7 @@ from mjx_reinforce.training.slots import Compiled, Slots, Stopwatch, compile_slo
 
 
 def conduct(
-    prepared: Prepared,
+    plan: Plan,
     files: Files[Any] | None,
     display: Display,
     observers: Sequence[Observer[Any]],
@@ -27,8 +27,8 @@ def conduct(
     """Trains the chunks that have not ended yet, to their end or until they are interrupted.
 
     Args:
-      prepared: what a run or a sweep is made of.
-      files: of it, if it has any.
+      plan: what a run or a sweep is made of.
+      files: of it. A sweep always has some; a run has None if it is to leave nothing.
       display: its screen.
       observers: who sees it, besides these.
       interrupt: what listens to signals.
@@ -39,68 +39,161 @@ def conduct(
     Raises:
       OSError: the first or the last files cannot be written.
     """
-    written = [] if files is None else [files]
-    left = [
-        part._replace(chunks=[x for x in part.chunks if not any(f.has(x.name) for f in written)])
-        for part in prepared.parts
-    ]
-    screen = display if prepared.alone else SweepScreen(display, prepared, left)
-    everyone, clock = [*written, screen, *observers], prepared.clock
-    chunks = _compiled([part for part in left if part.chunks], clock)
-    chunks = itertools.chain([*itertools.islice(chunks, 1)], chunks)  # compiles the first
-    clock.compiling = time.perf_counter() - clock.began
-    # Where others compute beside this, what it computed itself is nearer to a quiet machine's time.
-    quiet = min(clock.compiling, time.process_time() - clock.computed)
-    if any(part.chunks for part in left):
-        keep_seconds(prepared.design.configs[0], prepared.design.over, quiet)
+    # No loop below runs for the files of a run that leaves none.
+    own_files = [] if files is None else [files]
+    unfinished_groups = _unfinished(plan.group_plans, own_files)
+    screen = display
+    if plan.design.is_sweep:
+        screen = SweepScreen(display, plan, unfinished_groups)
+    # The files are first: an error of theirs ends the run before a user's function sees an
+    # evaluation that is nowhere on the disk.
+    all_observers = [*own_files, screen, *observers]
+    clock = plan.clock
+    compiled_chunks = _first_compiled(unfinished_groups, plan)
     # Not before: a kill while it compiles leaves nothing that would refuse the next.
     interrupt.defer(display.say)
-    for each in written:
-        each.open()
+    for file in own_files:
+        file.open()
     display.start(clock.compiling)
     driver = None
-    for part, runs, compiled in chunks:
-        config = dataclasses.replace(part.group.config, num_seeds=len(runs.seed))
-        settings = {name: values[runs.place] for name, values in part.group.settings.items()}
-        slots = Slots(compiled, runs.seed, settings)
-        if prepared.alone:
-            given = config, part.ready.threshold, slots, runs, prepared.found, prepared.actors
-            driver = begin_run(*given, display.say, everyone, interrupt.heard)
-        else:
-            driver = Training(config, slots, Record(config), runs, everyone)
-        for observer in everyone:
+    for group_plan, runs, compiled in compiled_chunks:
+        driver = _begin(
+            plan,
+            group_plan,
+            runs,
+            compiled,
+            say=display.say,
+            observers=all_observers,
+            interrupted=interrupt.heard,
+        )
+        for observer in all_observers:
             observer.began(driver)
         driver.drive(interrupt.heard)
-        for observer in everyone:
+        for observer in all_observers:
             observer.ended(driver)
+        # A chunk that is not done was interrupted, and so is what would follow it.
         if not driver.record.done():
             break
-    if isinstance(driver, Driver):
-        # A signal after that changes nothing: what is left takes a second or two.
-        test, engine = driver.test(interrupt.heard), prepared.parts[0].ready.engine
-        summary = driver.summary(engine, clock.compiling, test)
-    else:
+    if plan.design.is_sweep:
         assert files is not None
-        ended = driver is None or driver.record.done()
-        summary = dict(files.contents, status="finished" if ended else "interrupted")
-        summary["compile_seconds"] += clock.compiling
-        summary["run_seconds"] += clock.running()
-    for observer in everyone:
+        summary = _sweep_summary(files.contents, driver, clock)
+    else:
+        assert isinstance(driver, Driver)
+        # A signal after that changes nothing: what is left takes a second or two.
+        test = driver.test(interrupt.heard)
+        summary = driver.summary(plan.group_plans[0].ready.engine, clock.compiling, test)
+    for observer in all_observers:
         observer.finished(driver, summary)
     return driver, summary
 
 
-def _compiled(parts: Sequence[Part], clock: Stopwatch) -> Iterator[tuple[Part, Runs, Compiled]]:
+def _unfinished(group_plans: Sequence[GroupPlan], own_files: Sequence[Files]) -> list[GroupPlan]:
+    """Returns the groups of which some chunks have not ended yet, with these chunks alone."""
+    unfinished_groups = []
+    for group_plan in group_plans:
+        chunks = [x for x in group_plan.chunks if not any(file.has(x.name) for file in own_files)]
+        if chunks:
+            unfinished_groups.append(group_plan._replace(chunks=chunks))
+    return unfinished_groups
+
+
+def _begin(
+    plan: Plan,
+    group_plan: GroupPlan,
+    runs: Runs,
+    compiled: Compiled,
+    *,
+    say: Callable[[str], None],
+    observers: Sequence[Observer[Any]],
+    interrupted: Callable[[], bool],
+) -> Training:
+    """Returns the runs of a chunk before their first update.
+
+    Args:
+      plan: of the run or the sweep.
+      group_plan: of the chunk's group.
+      runs: of the chunk.
+      compiled: the programs of the group.
+      say: shows a line to the user.
+      observers: who sees the runs.
+      interrupted: whether they are to end soon.
+    """
+    group = group_plan.group
+    # The number of seeds is here that of the chunk's runs, whatever configuration each is of.
+    config = dataclasses.replace(group.config, num_seeds=len(runs.seed))
+    settings = {name: values[runs.place] for name, values in group.settings.items()}
+    slots = Slots(compiled, runs.seed, settings)
+    if plan.design.is_sweep:
+        return Training(config, slots, Record(config), runs, observers=observers)
+    return begin_run(
+        config,
+        group_plan.ready.threshold,
+        slots,
+        runs,
+        plan.checkpoint,
+        actors=plan.actors,
+        say=say,
+        observers=observers,
+        interrupted=interrupted,
+    )
+
+
+def _sweep_summary(
+    contents: Mapping[str, Any], driver: Training | None, clock: Stopwatch
+) -> dict[str, Any]:
+    """Returns the contents of sweep.json at the end.
+
+    Args:
+      contents: of sweep.json so far.
+      driver: of the chunk that was trained last; None if nothing was left to train.
+      clock: of this process.
+    """
+    is_done = driver is None or driver.record.done()
+    return {
+        **contents,
+        "status": "finished" if is_done else "interrupted",
+        # A sweep that was resumed has spent time before, which its sweep.json says.
+        "compile_seconds": contents["compile_seconds"] + clock.compiling,
+        "run_seconds": contents["run_seconds"] + clock.running(),
+    }
+
+
+def _compiled(
+    group_plans: Sequence[GroupPlan], clock: Stopwatch
+) -> Iterator[tuple[GroupPlan, Runs, Compiled]]:
     """Yields chunks with the programs of their group; those of the next compile meanwhile."""
-    waiting = [functools.partial(_compile, part) for part in parts[:1]]
-    for number, part in enumerate(parts, start=1):
-        compiled = clock.wait(waiting.pop())
-        following = [functools.partial(_compile, later) for later in parts[number : number + 1]]
-        waiting = [started(task).result for task in following]
-        for runs in part.chunks:
-            yield part, runs, compiled
+    # A list with the task of the group that is next, or with none behind the last one.
+    tasks = [functools.partial(_compile, group_plan) for group_plan in group_plans[:1]]
+    for number, group_plan in enumerate(group_plans, start=1):
+        compiled = clock.wait(tasks.pop())
+        # One group ahead, and not all: compiling takes memory and cores from what trains.
+        following = [
+            functools.partial(_compile, later) for later in group_plans[number : number + 1]
+        ]
+        tasks = [started(task).result for task in following]
+        for runs in group_plan.chunks:
+            yield group_plan, runs, compiled
 
 
-def _compile(part: Part) -> Compiled:
+def _first_compiled(
+    group_plans: Sequence[GroupPlan], plan: Plan
+) -> Iterator[tuple[GroupPlan, Runs, Compiled]]:
+    """Returns ``_compiled`` of groups, whose first programs are compiled now, before anything runs.
+
+    How long that took is on the plan's clock, and kept for the forecast of later runs.
+    """
+    clock = plan.clock
+    compiled_chunks = _compiled(group_plans, clock)
+    # A generator does nothing before it is asked: the first chunk is taken from it, and put back.
+    compiled_chunks = itertools.chain([*itertools.islice(compiled_chunks, 1)], compiled_chunks)
+    clock.compiling = time.perf_counter() - clock.began
+    # Where others compute beside this, what it computed itself is nearer to a quiet machine's time.
+    quiet_seconds = min(clock.compiling, time.process_time() - clock.computed)
+    if group_plans:
+        keep_seconds(plan.design.configs[0], plan.design.over, quiet_seconds)
+    return compiled_chunks
+
+
+def _compile(group_plan: GroupPlan) -> Compiled:
     """Returns the programs of a group."""
-    return compile_slots(part.ready.programs(), part.group.config, part.width)
+    return compile_slots(group_plan.ready.programs(), group_plan.group.config, group_plan.width)

@@ -66,16 +66,27 @@ class Design:
     chunk_runs: int | None = None
 
     @property
-    def given(self) -> tuple[str, ...]:
-        """The settings that the user chose."""
+    def is_sweep(self) -> bool:
+        """Whether it is a sweep; a run is one configuration, and goes over nothing."""
+        return bool(self.over)
+
+    @property
+    def kind(self) -> str:
+        """What people call it: a run or a sweep."""
+        return "sweep" if self.is_sweep else "run"
+
+    @property
+    def chosen_names(self) -> tuple[str, ...]:
+        """The names of the settings that the user chose."""
         return () if self.default is None else changed(self.base, self.default)
 
     @functools.cached_property
     def directory(self) -> Path:
         """Where its files are; ``runs/<env>-<time>`` if nobody said."""
         stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S-%f")[:-3]
-        named = Path("runs") / f"{self.base.env.replace(':', '.')}-{stamp}"
-        return self.base.resume or self.base.output or named
+        # The id of a user's own task is module:Class, and some file systems refuse the colon.
+        by_default = Path("runs") / f"{self.base.env.replace(':', '.')}-{stamp}"
+        return self.base.resume or self.base.output or by_default
 
     def count(self) -> int:
         """Returns how many configurations it has."""
@@ -106,12 +117,15 @@ def read_design(directory: Path) -> Design:
       ValueError: there is none, or its first file is damaged or of another version.
     """
     record = read_record(directory)
+    # Of the first files that of a sweep alone has this entry.
     if "over" not in record:
         base = as_config(record, directory / "config.json")
         return Design(base=dataclasses.replace(base, resume=directory))
     path = directory / "sweep.json"
     with naming_damage(path):
-        settings, exact = dict(record["settings"]), record["exact"]
+        settings = dict(record["settings"])
+        exact = record["exact"]
+        # JSON has no tuples: a list among the values is one of layers, as ``read_over`` has it.
         over = {
             name: [tuple(x) if isinstance(x, list) else x for x in values]
             for name, values in record["over"].items()
@@ -125,20 +139,23 @@ def check_design(design: Design) -> None:
 
     A configuration reads each setting that is swept, and one of them each that was given.
     """
-    if design.over:
+    if design.is_sweep:
         _check_sweep(design)
     check_each(design.base)
-    runs = design.count() * design.base.num_seeds
-    if runs * _RESULT > host_memory():
+    # By the count alone: ``design.configs`` below would itself fill the memory.
+    num_runs = design.count() * design.base.num_seeds
+    if num_runs * _RESULT > host_memory():
         raise ValueError(
-            f"the results of {runs:,} runs do not fit into memory: they need about "
-            f"{gigabytes(runs * _RESULT)}, {gigabytes(host_memory())} are here; lower --num-seeds "
-            "or the number of values after --over"
+            f"the results of {num_runs:,} runs do not fit into memory: they need about "
+            f"{gigabytes(num_runs * _RESULT)}, {gigabytes(host_memory())} are here; lower "
+            "--num-seeds or the number of values after --over"
         )
     for config, values in zip(design.configs, design.configurations, strict=True):
         check(config)
-        check_read(config, values or design.given)
-    for name in set(design.given).difference(design.over):
+        check_read(config, values or design.chosen_names)
+    # In a sweep a setting may be of use to some configurations alone. Where none reads it, the
+    # first one stands for all in the message.
+    for name in set(design.chosen_names).difference(design.over):
         if not any(is_read(name, config) for config in design.configs):
             check_read(design.configs[0], [name])
 
@@ -164,17 +181,17 @@ _ENV_ONCE = {
 _EXAMPLE = "such as --over learning-rate 1e-3 1e-2"
 
 
-def read_over(given: Sequence[Sequence[str]]) -> dict[str, list[Any]]:
+def read_over(flags: Sequence[Sequence[str]]) -> dict[str, list[Any]]:
     """Returns the values of each setting from ``--over NAME VALUE VALUE ...``, in that order.
 
     Args:
-      given: the words after each ``--over``.
+      flags: the words after each ``--over``.
 
     Raises:
       ValueError: a setting does not exist or stands twice, or a value is not of its type.
     """
     over: dict[str, list[Any]] = {}
-    for words in given:
+    for words in flags:
         if not words:
             raise ValueError(f"--over needs a setting and its values, {_EXAMPLE}")
         name = words[0].removeprefix("--").replace("-", "_")
@@ -188,12 +205,13 @@ def read_over(given: Sequence[Sequence[str]]) -> dict[str, list[Any]]:
 
 def _of_env(name: str) -> str | None:
     """Returns the setting of the environment that a name after --over means, if it is one."""
-    own = name.removeprefix(_ENV_SET)
-    return own if own != name and own.isidentifier() else None
+    setting = name.removeprefix(_ENV_SET)
+    return setting if setting != name and setting.isidentifier() else None
 
 
 def _unknown(word: str) -> str:
     """Returns the message about a word that is no setting."""
+    # The field's word for it is too far from our name to be found by spelling.
     if word == "distribution":
         near: str | None = "policy"
     else:
@@ -219,31 +237,43 @@ def check_over(base: Config, over: Mapping[str, Sequence[Any]]) -> None:
                 f"{flag(field.name)} logs a run; leave it out: a sweep writes curves.npz"
             )
     for name, values in over.items():
-        if own := _of_env(name):
-            why = _ENV_ONCE.get(own)
+        env_setting = _of_env(name)
+        if env_setting:
+            reason = _ENV_ONCE.get(env_setting)
         else:
             check_name("setting", name, _FIELDS)
-            why = _FIELDS[name].metadata.get("once")
-        if why:
-            raise ValueError(f"a sweep cannot go over {spoken(name)}: {why}")
+            reason = _FIELDS[name].metadata.get("once")
+        if reason:
+            raise ValueError(f"a sweep cannot go over {spoken(name)}: {reason}")
         if len(values) < 2:
-            passed = f"--env-set {own}={values[0]}" if own and values else flag(name)
-            one = f"; for one value pass {passed}" if values else f", {_EXAMPLE}"
-            raise ValueError(f"--over {spoken(name)} needs two values or more{one}")
-        twice = [x for i, x in enumerate(values) if x in values[:i]]
-        if twice:
-            raise ValueError(f"--over {spoken(name)} has the value {twice[0]} twice")
+            if not values:
+                remedy = f", {_EXAMPLE}"
+            elif env_setting:
+                remedy = f"; for one value pass --env-set {env_setting}={values[0]}"
+            else:
+                remedy = f"; for one value pass {flag(name)}"
+            raise ValueError(f"--over {spoken(name)} needs two values or more{remedy}")
+        # Two equal configurations would have the same seeds, and so count each result twice.
+        repeated = [x for i, x in enumerate(values) if x in values[:i]]
+        if repeated:
+            raise ValueError(f"--over {spoken(name)} has the value {repeated[0]} twice")
 
 
 def _with_values(base: Config, values: Mapping[str, Any]) -> Config:
     """Returns settings with other values, also of settings of the environment."""
-    plain = {name: value for name, value in values.items() if not _of_env(name)}
-    config = dataclasses.replace(base, **plain)
-    given = {own: f"{own}={value}" for name, value in values.items() if (own := _of_env(name))}
-    if not given:
+    fields = {}
+    env_words = {}
+    for name, value in values.items():
+        if env_setting := _of_env(name):
+            env_words[env_setting] = f"{env_setting}={value}"
+        else:
+            fields[name] = value
+    config = dataclasses.replace(base, **fields)
+    if not env_words:
         return config
-    kept = [word for word in config.env_set if word.partition("=")[0] not in given]
-    return dataclasses.replace(config, env_set=(*kept, *given.values()))
+    # The base may set what is swept, too, and an environment refuses a setting that stands twice.
+    base_words = [word for word in config.env_set if word.partition("=")[0] not in env_words]
+    return dataclasses.replace(config, env_set=(*base_words, *env_words.values()))
 
 
 def _value(name: str, word: str) -> Any:
@@ -254,7 +284,9 @@ def _value(name: str, word: str) -> Any:
     kind = (int | float | str) if _of_env(name) else _FIELDS[name].type
     with contextlib.suppress(ValueError):
         return read_as(kind, word)
-    wanted = f"{spoken_kind(kind)}{'; write spaces between values' if ',' in word else ''}"
+    kind_in_words = spoken_kind(kind)
     if get_origin(kind) is tuple:
-        wanted = "layers, such as 32,32, or none"
-    raise ValueError(f"--over {spoken(name)} has the value {word!r}, not {wanted}")
+        kind_in_words = "layers, such as 32,32, or none"
+    elif "," in word:
+        kind_in_words += "; write spaces between values"
+    raise ValueError(f"--over {spoken(name)} has the value {word!r}, not {kind_in_words}")

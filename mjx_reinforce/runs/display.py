@@ -18,7 +18,7 @@ from rich.text import Text
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.reports.experiment import counted, say, setting_in_words
-from mjx_reinforce.runs.plan import Part, Prepared
+from mjx_reinforce.runs.plan import GroupPlan, Plan
 from mjx_reinforce.statistics import enough, iqm
 from mjx_reinforce.training import record
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer, Training
@@ -51,19 +51,23 @@ class Display(Observer[Driver]):
         """Takes the terminal, on which it shows nothing if it is to be quiet."""
         # What users name is printed as it is: "[bold]" and ":smile:" are no commands.
         self.console = _Screen(markup=False, emoji=False, quiet=quiet)
+        spinner = "line" if self.console.options.ascii_only else "dots"
         self._bar = _Bar(
-            SpinnerColumn("line" if self.console.options.ascii_only else "dots"),
+            SpinnerColumn(spinner),
             TextColumn("{task.description}"),
             BarColumn(bar_width=30),
-            TextColumn("{task.fields[done]}"),
+            TextColumn("{task.fields[percent]}"),
             TimeElapsedColumn(),
-            TextColumn("{task.fields[left]}"),
+            TextColumn("{task.fields[time_left]}"),
             console=self.console,
             disable=not self.console.is_terminal,
         )
-        self._task = self._bar.add_task("compiling", total=None, done="", left="")
-        #: What is wrong with the user's model, and whether numbers that are not finite were told.
-        self._of_model, self._told = "", False
+        # No total: nobody knows how long compiling takes, and rich then draws a moving bar.
+        self._task = self._bar.add_task("compiling", total=None, percent="", time_left="")
+        #: What is wrong with the user's model, "" for nothing.
+        self._model_warning = ""
+        #: Whether a line about numbers that are not finite was shown.
+        self._nonfinite_shown = False
 
     def __enter__(self) -> "Display":
         """Starts drawing."""
@@ -92,7 +96,7 @@ class Display(Observer[Driver]):
     def warn_of_model(self, instability: str | None) -> None:
         """Says that a model explodes in C MuJoCo, now and where its run is stopped."""
         if instability is not None:
-            self._of_model = instability
+            self._model_warning = instability
             self.say(instability, "yellow")
 
     def show_commands(self, commands: Mapping[str, str]) -> None:
@@ -101,55 +105,64 @@ class Display(Observer[Driver]):
             self.say(f"{purpose}:  {line}", whole=True)
 
     def show_summary(
-        self, summary: dict[str, Any], directory: Path, again: str = "", own: str = ""
+        self, summary: dict[str, Any], directory: Path, resume_flags: str = "", play_flags: str = ""
     ) -> None:
         """Says what a run learned, where its files are, and what can be done with them.
 
         Args:
           summary: of summary.json.
           directory: of the run.
-          again: the flags that name the user's code where the run goes on.
-          own: those of them that its policies need.
+          resume_flags: those that name the user's code where the run goes on.
+          play_flags: those of them that its policies need.
         """
         self.say(summary_table(summary))
-        where = shlex.quote(str(directory))
+        # In commands that are to be copied the path is quoted for the shell, elsewhere as it is.
+        quoted = shlex.quote(str(directory))
         if summary["status"] == "interrupted":
-            self.say(f"Interrupted: go on with --resume {where}{again}", whole=True)
+            self.say(f"Interrupted: go on with --resume {quoted}{resume_flags}", whole=True)
             return
         self.say(f"Files in {directory}; the picture is learning_curve.png.")
         self.show_commands(
             {
-                "To see the best seed play": f"{command('watch')} {where}{own}",
-                "For a page of all figures": f"{command('report')} {where}",
+                "To see the best seed play": f"{command('watch')} {quoted}{play_flags}",
+                "For a page of all figures": f"{command('report')} {quoted}",
             }
         )
         if summary["status"] == "stopped":
-            self.say(
-                "; ".join(filter(None, (f"stopped: {summary['reason']}", self._of_model))), "red"
-            )
+            message = f"stopped: {summary['reason']}"
+            # A model that explodes in C MuJoCo is the likely cause, and its line is far above.
+            if self._model_warning:
+                message += f"; {self._model_warning}"
+            self.say(message, "red")
 
     def start(self, compile_seconds: float) -> None:
         """Marks the end of compilation, from where the time left is counted."""
         self.say(f"compiled in {compile_seconds:.1f} s")
-        self._bar.reset(self._task, total=1.0, description="training", done="", left="")
+        self._bar.reset(self._task, total=1.0, description="training", percent="", time_left="")
 
-    def show_progress(self, now: record.Progress) -> None:
+    def show_progress(self, progress: record.Progress) -> None:
         """Shows how far the run is and how well it does."""
-        self._bar.line, left = _returns_and_speed(now), _time_left(now)
-        done = percent_done(min(now.fraction, 1.0))
-        self._bar.update(self._task, completed=now.fraction, done=done, left=left)
+        returns_and_speed = _returns_and_speed(progress)
+        time_left = _time_left(progress)
+        # The last update may go beyond the budget.
+        percent = percent_done(min(progress.fraction, 1.0))
+        self._bar.line = returns_and_speed
+        self._bar.update(
+            self._task, completed=progress.fraction, percent=percent, time_left=time_left
+        )
+        # In a file or a pipe, where rich draws no bar.
         if not self.console.is_terminal:
             self.say(
-                f"update {now.updates:5d}  {now.env_steps:12,.0f} env steps per seed  "
-                f"{_returns_and_speed(now)}  {done}  {left}".rstrip()
+                f"update {progress.updates:5d}  {progress.env_steps:12,.0f} env steps per seed  "
+                f"{returns_and_speed}  {percent}  {time_left}".rstrip()
             )
 
     def updated(self, driver: Driver, met: np.ndarray) -> None:
         """Says once which seeds met numbers that are not finite; the last table counts them."""
-        if met.any() and not self._told:
-            self._told = True
-            said = record.describe_nonfinite(met, driver.config.first_seed, driver.updates())
-            self.say(said, "yellow")
+        if met.any() and not self._nonfinite_shown:
+            self._nonfinite_shown = True
+            text = record.describe_nonfinite(met, driver.config.first_seed, driver.updates())
+            self.say(text, "yellow")
 
     def evaluated(self, driver: Driver, evaluation: Evaluation, rows: Arrays) -> None:
         """Shows how far the run is and how well it does."""
@@ -159,56 +172,74 @@ class Display(Observer[Driver]):
 class SweepScreen(Observer[Training]):
     """Shows how far a sweep is, and which of its runs are trained."""
 
-    def __init__(self, display: Display, prepared: Prepared, parts: Iterable[Part]):
+    def __init__(self, display: Display, plan: Plan, group_plans: Iterable[GroupPlan]):
         """Takes the display, the sweep, and what of it is to be trained."""
-        self._display, self._prepared = display, prepared
-        #: Runs that have ended here, what checkpoints brought of them, and of how many.
-        self._done, self._brought = 0, 0.0
-        self._total = sum(len(runs.seed) for part in parts for runs in part.chunks)
+        self._display = display
+        self._plan = plan
+        #: How many runs have ended in this process.
+        self._num_ended = 0
+        #: Whole budgets of runs that checkpoints had used before this process.
+        self._budgets_before = 0.0
+        self._num_runs = sum(
+            len(runs.seed) for group_plan in group_plans for runs in group_plan.chunks
+        )
 
     def began(self, driver: Training) -> None:
         """Says which configurations the lines that follow are of."""
-        self._brought += driver.record.used_up()
-        runs, every = driver.runs, self._prepared.design.configurations
-        here = [every[number] for number in np.unique(runs.configuration)]
-        values = {name: [*dict.fromkeys(say(values[name]) for values in here)] for name in here[0]}
-        count = f"{counted(len(here), 'configuration')} of {len(every):,}"
-        few = {name: x if len(x) < 5 else (x[0], "...", x[-1]) for name, x in values.items()}
-        said = (f"{setting_in_words(name)} {', '.join(x)}" for name, x in few.items())
-        self._display.say(f"{'; '.join(said)} ({count}, {counted(len(runs.seed), 'run')})")
+        # The files came first, and restored a checkpoint if there was one: until now nothing of
+        # this chunk was trained by this process.
+        self._budgets_before += driver.record.used_up()
+        runs = driver.runs
+        configurations = self._plan.design.configurations
+        in_chunk = [configurations[number] for number in np.unique(runs.configuration)]
+        settings = []
+        for name in in_chunk[0]:
+            # Each value once, in the order of the sweep; of many the ends are enough for a line.
+            values = [*dict.fromkeys(say(configuration[name]) for configuration in in_chunk)]
+            if len(values) >= 5:
+                values = [values[0], "...", values[-1]]
+            settings.append(f"{setting_in_words(name)} {', '.join(values)}")
+        count = f"{counted(len(in_chunk), 'configuration')} of {len(configurations):,}"
+        self._display.say(f"{'; '.join(settings)} ({count}, {counted(len(runs.seed), 'run')})")
 
     def updated(self, driver: Training, met: np.ndarray) -> None:
         """Shows how far it is."""
-        done = self._done + driver.record.used_up()
-        fraction, gained = float(done / self._total), float(done - self._brought) / self._total
-        running = self._prepared.clock.running()
-        now = driver.record.measure(fraction, driver.seconds(), gained, running)
-        self._display.show_progress(now)
+        budgets = self._num_ended + driver.record.used_up()
+        fraction = float(budgets / self._num_runs)
+        # The time left is estimated from what this process trained: the time that earlier ones
+        # took is in no clock of it.
+        gained = float(budgets - self._budgets_before) / self._num_runs
+        running = self._plan.clock.running()
+        progress = driver.record.measure(fraction, driver.seconds(), gained, running)
+        self._display.show_progress(progress)
 
     def ended(self, driver: Training) -> None:
         """Counts the runs."""
-        self._done += len(driver.runs.seed)
+        self._num_ended += len(driver.runs.seed)
 
 
-def _returns_and_speed(now: record.Progress) -> str:
+def _returns_and_speed(progress: record.Progress) -> str:
     """Returns the returns and, after a block of updates, the mean speed."""
-    text = f"return {now.iqm:7.1f}  worst {now.worst:7.1f}"
-    if now.failed:
-        text = f"return {now.iqm:7.1f}  worst nan ({now.failed:,} of {now.num_seeds:,} seeds)"
-    if not math.isnan(now.env_steps_per_second):
-        text += f"  {now.env_steps_per_second:,.0f} steps/s"
+    text = f"return {progress.iqm:7.1f}  worst {progress.worst:7.1f}"
+    if progress.failed:
+        seeds = f"{progress.failed:,} of {progress.num_seeds:,} seeds"
+        text = f"return {progress.iqm:7.1f}  worst nan ({seeds})"
+    # NaN before the first block of updates.
+    if not math.isnan(progress.env_steps_per_second):
+        text += f"  {progress.env_steps_per_second:,.0f} steps/s"
     return text
 
 
-def _time_left(now: record.Progress) -> str:
+def _time_left(progress: record.Progress) -> str:
     """Returns how long the run still takes, empty where nobody knows."""
-    if math.isnan(now.seconds_left):
+    if math.isnan(progress.seconds_left):
         return ""
-    return f"left {datetime.timedelta(seconds=math.ceil(now.seconds_left))}"
+    return f"left {datetime.timedelta(seconds=math.ceil(progress.seconds_left))}"
 
 
 def percent_done(fraction: float) -> str:
     """Returns a fraction as a percentage with one decimal, rounded down: 100% is all."""
+    # As a decimal number: a float such as 0.29 is a little less, and would be rounded to 28.9%.
     shown = Decimal(repr(fraction)).quantize(Decimal("0.001"), ROUND_DOWN)
     return f"{100 * shown:.1f}%"
 
@@ -218,11 +249,15 @@ def summary_table(summary: dict[str, Any]) -> Table:
     num_seeds = f"{summary['num_seeds']:,}"
     table = Table(title=f"{summary['env']}, {num_seeds} seeds", show_header=False)
     low, high = summary["iqm_ci"]
-    known = math.isfinite(low) and math.isfinite(high)
-    interval = f"95% interval {low:.1f} to {high:.1f}" if known else "no interval"
-    interval += "" if enough(summary["num_seeds"]) else " below six seeds"
+    if math.isfinite(low) and math.isfinite(high):
+        interval = f"95% interval {low:.1f} to {high:.1f}"
+    else:
+        interval = "no interval"
+    if not enough(summary["num_seeds"]):
+        interval += " below six seeds"
     table.add_row("return, interquartile mean over seeds", f"{summary['iqm']:.1f}  ({interval})")
     returns = np.array(summary["final_returns"])
+    # ``min`` is NaN if a seed failed, which then is the worst; ``fmax`` passes over it.
     table.add_row("worst and best seed", f"{returns.min():.1f}, {np.fmax.reduce(returns):.1f}")
     if failed := summary["seeds_nonfinite_at_end"]:
         row = f"{failed:,} of {num_seeds}, worse than every other"
@@ -237,10 +272,12 @@ def summary_table(summary: dict[str, Any]) -> Table:
         if solved:
             table.add_row("env steps to solve", f"{min(solved):,} to {max(solved):,}")
     if "final_test_returns" in summary:
-        last, best = (iqm(np.array(summary[f"{kind}_test_returns"])) for kind in ("final", "best"))
+        last = iqm(np.array(summary["final_test_returns"]))
+        best = iqm(np.array(summary["best_test_returns"]))
         table.add_row("last policies on fresh starts", f"{last:.1f}")
-        lucky = " (their evaluation was luck)" * bool(best < last)
-        table.add_row("best policies on fresh starts", f"{best:.1f}{lucky}")
+        # The best policies were chosen by their evaluations, so those flatter them.
+        luck = " (their evaluation was luck)" if best < last else ""
+        table.add_row("best policies on fresh starts", f"{best:.1f}{luck}")
     table.add_row("env steps per second", f"{summary['env_steps_per_second']:,.0f}")
     useful = percent_done(summary["useful_step_fraction"])
     table.add_row("steps of episodes, of all simulated", useful)

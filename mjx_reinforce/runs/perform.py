@@ -6,8 +6,9 @@ Its directory is made, tried and locked before anything heavy is imported.
 import contextlib
 import errno
 import os
+import shlex
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,13 +21,16 @@ except ImportError as error:
     ) from error
 
 from mjx_reinforce import envs
+from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.files import check_place
 from mjx_reinforce.runs.design import Design, check_design
+from mjx_reinforce.settings.config import code_flags
 from mjx_reinforce.training.resume import read_record
 
 if TYPE_CHECKING:
+    from mjx_reinforce.report import WrittenReport
     from mjx_reinforce.runs.display import Display
     from mjx_reinforce.training.driver import Observer, Training
 
@@ -40,6 +44,7 @@ _ROOM = 2**20
 
 def _make(directory: Path) -> None:
     """Makes the directory of a run, or raises OSError; ValueError if it is in that of another."""
+    # Removing the outer run would remove this one, too.
     if (outer := _run_around(directory)) is not None:
         raise ValueError(
             f"the run directory {directory} would be inside the run {outer}; choose another "
@@ -61,9 +66,11 @@ def _check_unbegun(directory: Path) -> None:
 
 def _run_around(directory: Path) -> Path | None:
     """Returns the run or sweep that a directory is in, if any."""
+    # The real path: a symbolic link may lead into a run.
     for parent in Path(os.path.realpath(directory)).parents:
-        run = (parent / "config.json").exists() and (parent / "metrics.csv").exists()
-        if run or (parent / "sweep.json").exists():
+        # Other programs have a config.json, too; a run of this one has both.
+        is_run = (parent / "config.json").exists() and (parent / "metrics.csv").exists()
+        if is_run or (parent / "sweep.json").exists():
             return parent
     return None
 
@@ -101,30 +108,37 @@ def own_directory(
       ValueError: it is not empty, is in that of another run, cannot be written, or is another
         process's.
     """
-    made: list[Path] = []
-    with contextlib.ExitStack() as held:
+    new_folders: list[Path] = []
+    with contextlib.ExitStack() as stack:
         try:
-            made = [folder for folder in (directory, *directory.parents) if not folder.exists()]
+            # The innermost comes first, as ``remove_empty`` needs it.
+            candidates = (directory, *directory.parents)
+            new_folders = [folder for folder in candidates if not folder.exists()]
             if not resumed:
                 _make(directory)
             _try_to_write(directory)
-            held.enter_context(locked(directory))  # a folder in which another trains stays
+            # Before anything is removed below: a folder in which another process trains stays.
+            stack.enter_context(locked(directory))
+            # Under the lock: another process may have begun here a moment ago.
             if not resumed:
-                _check_unbegun(directory)  # not before: another may have been quicker
+                _check_unbegun(directory)
             place = directory.stat()
         except OSError as error:
-            remove_empty(made)
-            full = error.errno in _FULL
-            remedy = "make room there" if full else "make it a folder that you may write to"
-            remedy += "" if resumed else ", or choose another --output"
+            remove_empty(new_folders)
+            remedy = "make it a folder that you may write to"
+            if error.errno in _FULL:
+                remedy = "make room there"
+            if not resumed:
+                remedy += ", or choose another --output"
             raise ValueError(
                 f"cannot write to the run directory {directory} ({error.strerror}); {remedy}"
             ) from error
-        interrupt.on_exit(lambda: remove_empty(made))
+        # A signal that ends the process runs no ``finally``.
+        interrupt.on_exit(lambda: remove_empty(new_folders))
         try:
             yield place
         finally:
-            remove_empty(made)
+            remove_empty(new_folders)
 
 
 @contextlib.contextmanager
@@ -134,6 +148,7 @@ def locked(directory: Path) -> Iterator[None]:
     Raises:
       ValueError: another one does.
     """
+    # On the folder itself, so that no lock file is among those of the run.
     descriptor = os.open(directory, os.O_RDONLY)
     try:
         try:
@@ -151,6 +166,7 @@ def locked(directory: Path) -> Iterator[None]:
 class Outcome(NamedTuple):
     """What came of a run or a sweep.
 
+    design: what was to be done
     directory: of its files, None where none were asked for
     summary: what summary.json or sweep.json says
     driver: of the runs that were trained last; None where nothing was left to do
@@ -158,6 +174,7 @@ class Outcome(NamedTuple):
     display: its screen
     """
 
+    design: Design
     directory: Path | None
     summary: dict[str, Any]
     driver: "Training | None"
@@ -188,22 +205,29 @@ def perform(
       OSError: the first or the last files cannot be written.
     """
     check_design(design)
-    with contextlib.ExitStack() as held:
-        directory, resumed = design.directory if files else None, design.base.resume is not None
+    with contextlib.ExitStack() as stack:
+        directory = None
         place = None
-        if directory is not None:
-            place = held.enter_context(own_directory(directory, interrupt, resumed=resumed))
-        known = read_record(design.directory) if resumed else {}
-        if known.get("status") == "finished":  # of a sweep
-            return Outcome(directory, known, None, {}, _display(quiet=quiet))
+        resumed = design.base.resume is not None
+        if files:
+            directory = design.directory
+            place = stack.enter_context(own_directory(directory, interrupt, resumed=resumed))
+        # Under the lock: the process that trains there would change it.
+        saved_record = read_record(design.directory) if resumed else {}
+        # Only sweep.json has a status: a finished run goes on with a larger budget.
+        if saved_record.get("status") == "finished":
+            return Outcome(design, directory, saved_record, None, {}, _display(quiet=quiet))
         # A module of the user's is imported before JAX starts, which it may set up.
         first = design.configs[0]
-        env = None if envs.is_ours(first.env) else envs.make_set(first.env, first.env_set)
+        env = None
+        if not envs.is_ours(first.env):
+            env = envs.make_set(first.env, first.env_set)
+        # These imports load JAX and MJX, for seconds: bad input was refused before.
         try:
             configure_jax()
             from mjx_reinforce.envs.instability import instability
             from mjx_reinforce.runs.conduct import conduct
-            from mjx_reinforce.runs.plan import describe, prepare
+            from mjx_reinforce.runs.plan import describe, make_plan
             from mjx_reinforce.runs.saving import RunFiles, SweepFiles
             from mjx_reinforce.setup.compile_times import describe_compiling
         except MemoryError as error:
@@ -214,17 +238,19 @@ def perform(
         if (model := getattr(env, "mj_model", None)) is not None:
             display.warn_of_model(instability(model))
         with display.console.status("writing the simulation out"):
-            prepared = prepare(design, known, env, display.say)
-        display.say(describe(prepared))
+            plan = make_plan(design, saved_record, env, display.say)
+        display.say(describe(plan))
         display.say(describe_compiling(first, design.over))
         with display:
-            kind = SweepFiles if design.over else RunFiles
-            written = None
+            own_files = None
             if directory is not None and place is not None:
-                check_place(directory, place)  # writing the simulation out took its time
-                written = kind(directory, prepared, display.say)
-            driver, summary = conduct(prepared, written, display, observers, interrupt)
-        return Outcome(directory, summary, driver, prepared.parts[0].ready.policy, display)
+                # Writing the simulation out took its time, in which it may have been moved.
+                check_place(directory, place)
+                files_class = SweepFiles if design.is_sweep else RunFiles
+                own_files = files_class(directory, plan, display.say)
+            driver, summary = conduct(plan, own_files, display, observers, interrupt)
+        policy = plan.group_plans[0].ready.policy
+        return Outcome(design, directory, summary, driver, policy, display)
 
 
 def _display(*, quiet: bool) -> "Display":
@@ -232,3 +258,55 @@ def _display(*, quiet: bool) -> "Display":
     from mjx_reinforce.runs.display import Display
 
     return Display(quiet=quiet)
+
+
+def report_on(outcome: Outcome, *, report: bool = True) -> None:
+    """Says what a run or a sweep found, whose report is written, if that is asked for."""
+    display = outcome.display
+    directory = outcome.directory
+    summary = outcome.summary
+    assert directory is not None
+    if not outcome.design.is_sweep:
+        settings = vars(outcome.driver.config) if outcome.driver else {}
+        # Playing a policy runs the code of these two only; going on runs that of all settings.
+        for_playing = {name: settings[name] for name in ("env", "policy") if name in settings}
+        display.show_summary(summary, directory, code_flags(settings), code_flags(for_playing))
+        return
+    if summary["status"] == "interrupted":
+        flags = code_flags(summary["settings"])
+        display.say(f"interrupted; go on with --resume {directory}{flags}")
+        return
+    if outcome.driver is None and (directory / "report.html").exists():
+        display.say(f"the sweep in {directory} is finished")
+        return
+    took = (
+        f"compiling took {summary['compile_seconds']:.1f} s, training and evaluating "
+        f"{summary['run_seconds']:.1f} s"
+    )
+    if not report:
+        display.say(f"{took}. Files in {directory}")
+        return
+    display.say("writing the report")
+    # The lock of training is gone by now, and --resume in another process would write here, too.
+    with locked(directory):
+        written = _report(directory)
+    took += f", statistics and report {written.seconds:.1f} s"
+    for sentence in (*written.answer, f"{took}. Files in {directory}, first report.html"):
+        display.say(sentence)
+    display.show_commands(_watch_command(directory, written.best, summary["settings"]))
+
+
+def _report(directory: Path) -> "WrittenReport":
+    """Writes the report of a sweep; removes what a crash left of writing it."""
+    from mjx_reinforce import report
+
+    for leftover in [*directory.glob(".report.html.*"), *(directory / "report").glob(".*")]:
+        leftover.unlink()
+    return report.write_report([directory], directory / "report.html")
+
+
+def _watch_command(directory: Path, number: int, settings: Mapping[str, Any]) -> dict[str, str]:
+    """Returns the command that plays the best policy of a configuration, after what it does."""
+    place = shlex.quote(str(directory / "policies" / f"{number:03d}"))
+    flags = code_flags({name: settings[name] for name in ("env", "policy")})
+    return {"To see the best of it play": f"{command('watch')} {place}{flags}"}

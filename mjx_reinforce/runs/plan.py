@@ -49,14 +49,14 @@ class Group(NamedTuple):
         return len(self.members) * self.config.num_seeds
 
 
-class Part(NamedTuple):
-    """A group that is ready to be trained.
+class GroupPlan(NamedTuple):
+    """How a group is trained.
 
     group: its configurations
     ready: what their programs are made of
     limit: how many of its runs a chunk may have
     width: runs that a compiled program moves at once
-    chunks: its runs, in parts of about the same size
+    chunks: its runs, all chunks of about the same size
     """
 
     group: Group
@@ -66,63 +66,73 @@ class Part(NamedTuple):
     chunks: list[Runs]
 
 
-class Prepared(NamedTuple):
+class Plan(NamedTuple):
     """All that a run or a sweep is made of.
 
     design: what it is to do
-    parts: its groups
+    group_plans: how each of its groups is trained
     division: among which devices the runs are divided
-    known: what the first file of its directory says, if it goes on
-    found: the checkpoint from which a run goes on, if any
+    saved_record: what the first file of its directory says, if it goes on
+    checkpoint: from which a run goes on, if there is one
     actors: with which a run begins, if those of another
     clock: counts the time since this was asked for
     """
 
     design: Design
-    parts: list[Part]
+    group_plans: list[GroupPlan]
     division: Division
-    known: Mapping[str, Any]
-    found: Checkpoint | None
+    saved_record: Mapping[str, Any]
+    checkpoint: Checkpoint | None
     actors: Actor | None
     clock: Stopwatch
 
-    @property
-    def alone(self) -> bool:
-        """Whether it is a run, which is one configuration."""
-        return not self.design.over
 
-
-def prepare(
+def make_plan(
     design: Design,
-    known: Mapping[str, Any],
+    saved_record: Mapping[str, Any],
     env: Environment | None,
     say: Callable[[str], None],
-) -> Prepared:
+) -> Plan:
     """Returns what a run or a sweep is made of.
 
     Args:
       design: of it.
-      known: what the first file of its directory says, if it goes on.
+      saved_record: what the first file of its directory says, if it goes on.
       env: the environment of a run, if it is built already.
       say: shows a line to the user.
 
     Raises:
       ValueError: settings do not fit the environment, or it cannot go on here.
     """
-    clock, found = Stopwatch(), None
+    clock = Stopwatch()
     if design.base.resume is not None:
-        resume.check_same_program(design.directory, known, provenance())
-        found = None if design.over else resume.newest_checkpoint(design.base, say)
-    if design.over:
-        return Prepared(design, *_prepare_sweep(design, known), known, None, None, clock)
-    config, division, actors = design.base, divide_run(design.base), None
+        resume.check_same_program(design.directory, saved_record, provenance())
+    if design.is_sweep:
+        group_plans, division = _plan_sweep(design, saved_record)
+        return Plan(design, group_plans, division, saved_record, None, None, clock)
+    config = design.base
+    # A sweep has checkpoints, too, but one a chunk: its files look for them as it gets there.
+    checkpoint = None
+    if config.resume is not None:
+        checkpoint = resume.newest_checkpoint(config, say)
+    division = divide_run(config)
     ready = get_ready(config, design.default or config, env, division)
-    if config.init_from is not None and found is None:
+    actors = None
+    # The policies of a checkpoint began with those of the other run, and have learned since.
+    if config.init_from is not None and checkpoint is None:
         actors = last_actors(config, ready.policy)
+    # As config.json will say it: the run then goes on with this time limit, also in a later
+    # version, where the task's own may be another.
     config = dataclasses.replace(config, horizon=ready.horizon)
-    group, width = Group(config, np.zeros(1, int), {}), division.lanes(config.num_seeds)
-    part = Part(group, ready, config.num_seeds, width, split_runs(group, "000", 1))
-    return Prepared(design, [part], division, known, found, actors, clock)
+    group = Group(config, members=np.zeros(1, int), settings={})
+    group_plan = GroupPlan(
+        group=group,
+        ready=ready,
+        limit=config.num_seeds,
+        width=division.lanes(config.num_seeds),
+        chunks=split_runs(group, "000", 1),
+    )
+    return Plan(design, [group_plan], division, saved_record, checkpoint, actors, clock)
 
 
 #: Episodes are divided among GPUs only where each plays so many of an update, of all seeds: fewer
@@ -139,51 +149,68 @@ def divide_run(config: Config) -> Division:
     Args:
       config: its settings.
     """
-    here, num_seeds = jax.local_device_count(), config.num_seeds
-    width = -(-num_seeds // here)
+    num_devices = jax.local_device_count()
+    num_seeds = config.num_seeds
+    # Seeds a device, and from that the devices: of 5 seeds on 4 devices two each, on three.
+    width = -(-num_seeds // num_devices)
     by_seeds = Division(seeds=-(-num_seeds // width))
     on_cpu = jax.default_backend() == "cpu"
     if on_cpu and jax.__version__ == _DIVIDES_NO_EPISODES:
         return by_seeds
+    # Only the learners of this package that follow a gradient sum it over the devices.
     if find_algorithm(config.algorithm).search_episodes or is_own(config.algorithm):
         return by_seeds
-    episodes = max(n for n in range(1, here + 1) if config.num_episodes % n == 0)
-    each = num_seeds * config.episodes_per_update / episodes
-    enough = each >= _LEAST or on_cpu
-    # How many seeds' episodes a device plays, by either.
-    return Division(episodes=episodes) if enough and num_seeds / episodes < width else by_seeds
+    # Every device plays as many episodes of an update.
+    episodes = max(n for n in range(1, num_devices + 1) if config.num_episodes % n == 0)
+    episodes_per_device = num_seeds * config.episodes_per_update / episodes
+    enough = episodes_per_device >= _LEAST or on_cpu
+    # Both sides say how many seeds' episodes a device plays, and the lower one takes less time.
+    if enough and num_seeds / episodes < width:
+        return Division(episodes=episodes)
+    return by_seeds
 
 
-def _prepare_sweep(design: Design, known: Mapping[str, Any]) -> tuple[list[Part], Division]:
-    """Returns the groups of a sweep, and what divides them.
+def _plan_sweep(
+    design: Design, saved_record: Mapping[str, Any]
+) -> tuple[list[GroupPlan], Division]:
+    """Returns how the groups of a sweep are trained, and what divides them.
 
-    ``known`` is its sweep.json, if it goes on.
+    Args:
+      design: of the sweep.
+      saved_record: its sweep.json, if it goes on.
+
+    Raises:
+      ValueError: it goes on, and was begun on another number of devices.
     """
     # A program for several devices need not round as the one for a single device does.
     division = Division(seeds=1 if design.exact else jax.local_device_count())
-    old = known.get("local_devices", division.count)
-    if old != division.count:
+    saved_count = saved_record.get("local_devices", division.count)
+    if saved_count != division.count:
         raise ValueError(
-            f"{design.directory} was begun on {old} devices, and here are {division.count}; go on "
-            "with as many"
+            f"{design.directory} was begun on {saved_count} devices, and here are "
+            f"{division.count}; go on with as many"
         )
-    parts = []
+    group_plans = []
     for number, group in enumerate(make_groups(design)):
-        config, traced = group.config, tuple(group.settings)
-        chosen = vars(config).keys() & {*design.given, *design.over}
-        unset = {name: None for name in chosen if is_read(name, config)}
+        config = group.config
+        # Refused is what the policy does not read and differs from the default. Here that is what
+        # the user chose or sweeps, unless this configuration does not read it in any case.
+        chosen_names = vars(config).keys() & {*design.chosen_names, *design.over}
+        unset = {name: None for name in chosen_names if is_read(name, config)}
         default: Any = dataclasses.replace(config, **unset)
-        ready = get_ready(config, default, division=division, traced=traced)
-        part, limit = Part(group, ready, 0, 0, []), design.chunk_runs
-        if known:
-            limit = known["chunk_runs"][number]
-        elif limit is None:
-            limit = max(_capacity(part), division.count)
-        limit = limit if known else min(limit, group.num_runs)
-        count, width = divide(group, limit, division.count, exact=design.exact)
-        chunks = split_runs(group, f"{number:03d}", count)
-        parts.append(part._replace(limit=limit, width=width, chunks=chunks))
-    return parts, division
+        ready = get_ready(config, default, division=division, traced=tuple(group.settings))
+        # A sweep that goes on has the chunks that it had, by whose names their files are found,
+        # whatever memory there is here.
+        if saved_record:
+            limit = saved_record["chunk_runs"][number]
+        elif design.chunk_runs is not None:
+            limit = min(design.chunk_runs, group.num_runs)
+        else:
+            limit = min(max(_capacity(group, ready), division.count), group.num_runs)
+        num_chunks, width = divide(group, limit, division.count, exact=design.exact)
+        chunks = split_runs(group, f"{number:03d}", num_chunks)
+        group_plans.append(GroupPlan(group, ready, limit, width, chunks))
+    return group_plans, division
 
 
 def make_groups(design: Design) -> list[Group]:
@@ -196,6 +223,7 @@ def make_groups(design: Design) -> list[Group]:
     configs = design.configs
     traced = [_traced(config, design.over, design.exact) for config in configs]
     for number, (config, settings) in enumerate(zip(configs, traced, strict=True)):
+        # Two that differ in traced numbers alone are equal once these are taken out.
         compiled = dataclasses.replace(config, **dict.fromkeys(settings, None))
         members.setdefault((dataclasses.astuple(compiled), tuple(settings)), []).append(number)
     return [
@@ -230,13 +258,17 @@ def _traced(config: Config, swept: Collection[str], exact: bool) -> dict[str, fl
     }
 
 
-#: The states of a chunk take up to this part of the host's memory, with copies of them. So few runs
-#: are one chunk whatever they take: to know that takes a second a group.
-_MEMORY, _COPIES, _FEW = 0.6, 5, 256
-#: Episodes side by side in a slot of a device. On two CPU cores a run costs the same beside 7
-#: others or 255, and narrow slots waste less on runs of other lengths. An H200 needs 65,536 for
-#: most of its speed.
-_CPU_EPISODES, _GPU_EPISODES = 128, 65_536
+#: The states of a chunk take up to this part of the host's memory.
+_MEMORY = 0.6
+#: So many copies of the states are there at once.
+_COPIES = 5
+#: So few runs are one chunk whatever they take: to know that takes a second a group.
+_FEW = 256
+#: Episodes side by side in a slot of a CPU. On two cores a run costs the same beside 7 others or
+#: 255, and narrow slots waste less on runs of other lengths.
+_CPU_EPISODES = 128
+#: Those in a slot of a GPU: an H200 needs so many for most of its speed.
+_GPU_EPISODES = 65_536
 
 
 def divide(group: Group, limit: int, num_devices: int, *, exact: bool) -> tuple[int, int]:
@@ -248,13 +280,15 @@ def divide(group: Group, limit: int, num_devices: int, *, exact: bool) -> tuple[
       num_devices: among which a chunk is divided.
       exact: one run a slot.
     """
-    total = group.num_runs
-    num_chunks = -(-total // limit)
+    num_chunks = -(-group.num_runs // limit)
     if exact:
         return num_chunks, num_devices
-    most = -(-total // (num_chunks * num_devices))
-    side = _CPU_EPISODES if jax.default_backend() == "cpu" else _GPU_EPISODES
-    return num_chunks, num_devices * min(most, -(-side // group.config.episodes_per_update))
+    # A slot is no wider than a device's share of a chunk, and has about as many episodes as are
+    # played best at once. Both are rounded up.
+    share = -(-group.num_runs // (num_chunks * num_devices))
+    slot_episodes = _CPU_EPISODES if jax.default_backend() == "cpu" else _GPU_EPISODES
+    slot_runs = -(-slot_episodes // group.config.episodes_per_update)
+    return num_chunks, num_devices * min(share, slot_runs)
 
 
 def split_runs(group: Group, name: str, num_chunks: int) -> list[Runs]:
@@ -268,56 +302,71 @@ def split_runs(group: Group, name: str, num_chunks: int) -> list[Runs]:
       name: of the group, for the files.
       num_chunks: how many.
     """
-    total = len(group.members) * group.config.num_seeds
+    total = group.num_runs
     size = -(-total // num_chunks)
-    runs = np.arange(total)
-    seed, place = np.divmod(runs, len(group.members))
+    # Run i has seed i // C of configuration i % C, where the group has C configurations.
+    seed, place = np.divmod(np.arange(total), len(group.members))
     seed += group.config.first_seed
-    return [
-        Runs(f"{name}-{i:04d}", place[part], group.members[place[part]], seed[part])
-        for i, part in enumerate(runs[start : start + size] for start in range(0, total, size))
-    ]
+    chunks = []
+    for i, start in enumerate(range(0, total, size)):
+        chunk_place = place[start : start + size]
+        chunk_seed = seed[start : start + size]
+        chunks.append(Runs(f"{name}-{i:04d}", chunk_place, group.members[chunk_place], chunk_seed))
+    return chunks
 
 
-def _capacity(part: Part) -> int:
-    """Returns how many runs of a group may be under way, as memory holds their states."""
-    if part.group.num_runs <= _FEW:
+def _capacity(group: Group, ready: Ready) -> int:
+    """Returns how many runs of a group may be under way, as memory holds their states.
+
+    Args:
+      group: whose programs are traced for it, unless it is small.
+      ready: what they are made of.
+    """
+    if group.num_runs <= _FEW:
         return _FEW
-    size = StateRows(part.ready.programs().like).size
-    return max(1, int(_MEMORY * host_memory() / (_COPIES * size)))
+    state_bytes = StateRows(ready.programs().like).size
+    return max(1, int(_MEMORY * host_memory() / (_COPIES * state_bytes)))
 
 
-def describe(prepared: Prepared) -> str:
+def describe(plan: Plan) -> str:
     """Returns a sentence on what a run or a sweep will do on this machine."""
-    parts, first, ready = prepared.parts, prepared.parts[0].group.config, prepared.parts[0].ready
-    what, said = f"{counted(first.num_seeds, 'seed')} of {first.env}", ""
-    if not prepared.alone:
-        runs = [len(runs.seed) for part in parts for runs in part.chunks]
-        what = f"{counted(prepared.design.count(), 'configuration')} of {what}, {sum(runs):,} runs,"
-        said = (
-            f"; {counted(len(parts), 'compiled program')}, {counted(len(runs), 'chunk')} of up to "
-            f"{max(runs):,} runs"
-        )
+    group_plans = plan.group_plans
+    # Of a sweep the first configuration is named; the others may differ in what is swept.
+    config = group_plans[0].group.config
+    ready = group_plans[0].ready
+    subject = f"{counted(config.num_seeds, 'seed')} of {config.env}"
+    programs = ""
+    if plan.design.is_sweep:
+        sizes = [len(runs.seed) for group_plan in group_plans for runs in group_plan.chunks]
+        configurations = counted(plan.design.count(), "configuration")
+        subject = f"{configurations} of {subject}, {sum(sizes):,} runs,"
+        count = counted(len(group_plans), "compiled program")
+        programs = f"; {count}, {counted(len(sizes), 'chunk')} of up to {max(sizes):,} runs"
+    devices = _describe_devices(plan.division)
     return (
-        f"Training {what} by {first.algorithm}, {_budget(first)}, on {_where(prepared.division)}, "
-        f"with the engine {ready.engine}: {ready.why}{said}."
+        f"Training {subject} by {config.algorithm}, {_budget(config)}, on {devices}, with the "
+        f"engine {ready.engine}: {ready.why}{programs}."
     )
 
 
 def _budget(config: Config) -> str:
     """Returns for how long each seed is trained."""
-    asked = {"minutes": "min together", "max_updates": "updates each"}
+    units = {"minutes": "min together", "max_updates": "updates each"}
+    # ``minutes`` is in place of the env steps, whose default still stands in the settings.
     if config.minutes is None:
-        asked["env_steps"] = "env steps each"
-    budgets = {unit: getattr(config, name) for name, unit in asked.items()}
+        units["env_steps"] = "env steps each"
+    budgets = {unit: getattr(config, name) for name, unit in units.items()}
     return " or ".join(f"{x:,} {unit}" for unit, x in budgets.items() if x is not None)
 
 
-def _where(division: Division) -> str:
+def _describe_devices(division: Division) -> str:
     """Returns which devices compute, of how many here."""
-    here, kind = jax.local_device_count(), jax.local_devices()[0].device_kind
-    if here == 1:
+    num_devices = jax.local_device_count()
+    kind = jax.local_devices()[0].device_kind
+    if num_devices == 1:
         return counted(num_cores(), "CPU core") if kind == "cpu" else f"one {kind}"
-    shared = "seeds" if division.seeds > 1 else "episodes of an update"
-    which = f", which share the {shared}" if division.count > 1 else ""
-    return f"{division.count} of the {here} devices here ({kind}){which}"
+    text = f"{division.count} of the {num_devices} devices here ({kind})"
+    if division.count > 1:
+        shared = "seeds" if division.seeds > 1 else "episodes of an update"
+        text += f", which share the {shared}"
+    return text

@@ -17,9 +17,8 @@ from mjx_reinforce.export.policy_files import Player, played_policy
 from mjx_reinforce.export.run_files import Which
 from mjx_reinforce.files import Arrays, naming_damage, read_arrays, read_json
 from mjx_reinforce.learning.policy import Actor, Policy
-from mjx_reinforce.runs.command_line import report_on
 from mjx_reinforce.runs.design import Design, check_swept
-from mjx_reinforce.runs.perform import perform
+from mjx_reinforce.runs.perform import perform, report_on
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import worst_if_not_finite
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer
@@ -91,12 +90,17 @@ class RunResults(NamedTuple):
           which: "last" for the policy at the end of training, "best" for the one with the best
             evaluation.
         """
-        returns = self.test_returns if which == "last" else self.best_test_returns
+        if which == "last":
+            returns = self.test_returns
+            actors = self.actor
+        else:
+            returns = self.best_test_returns
+            actors = self.best
+        # A return that is NaN would be the greatest for ``argmax``.
         if seed is None:
             seed = int(np.argmax(worst_if_not_finite(returns)))
         if not 0 <= seed < len(returns):
             raise ValueError(f"seed must be in [0, {len(returns)}), got {seed}")
-        actors = self.actor if which == "last" else self.best
         actor = jax.tree.map(lambda x: x[seed], actors)
         return Player(self.config.env, seed, self.policy, actor)
 
@@ -141,14 +145,16 @@ def run(
             f"[lambda evaluation: print(evaluation.seconds)], got {observers!r}"
         )
     config = _beginning("config", config, output)
+    # An ``Interrupt`` hears nothing before it is entered: signals are the caller's.
     outcome = perform(
         Design(base=config),
-        Interrupt(),  # that hears nothing: signals are the caller's
+        Interrupt(),
         [Callbacks(observers)],
         files=config.output is not None,
         quiet=quiet,
     )
-    driver, summary = outcome.driver, outcome.summary
+    driver = outcome.driver
+    summary = outcome.summary
     assert isinstance(driver, Driver)
     history = driver.record.history()
     return RunResults(
@@ -238,15 +244,19 @@ def sweep(
     """
     base = _beginning("base", base, output)
     check_swept(over)
-    over = {name.replace("-", "_"): values for name, values in over.items()}  # as --over has them
-    with contextlib.ExitStack() as held:
-        place = asked = base.output
+    # Both spellings are accepted, as --over does.
+    over = {name.replace("-", "_"): values for name, values in over.items()}
+    directory = base.output
+    with contextlib.ExitStack() as stack:
+        place = directory
+        # The chunks of a sweep meet in its files alone, so one that leaves none has a folder, too.
         if place is None:
-            place = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="sweep-")))
+            place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sweep-")))
         base = dataclasses.replace(base, output=place)
         design = Design(base=base, over=over, exact=exact, chunk_runs=chunk_runs)
-        report_on(perform(design, Interrupt(), quiet=quiet), report=report and asked is not None)
-        return read_results(place)._replace(directory=asked)
+        outcome = perform(design, Interrupt(), quiet=quiet)
+        report_on(outcome, report=report and directory is not None)
+        return read_results(place)._replace(directory=directory)
 
 
 def _beginning(name: str, config: Config, output: Path | str | None) -> Config:
@@ -264,7 +274,9 @@ def _beginning(name: str, config: Config, output: Path | str | None) -> Config:
             "what is there"
         )
     place = config.output if output is None else output
-    place = None if place is None else Path(os.path.expanduser(place))
+    # ``~`` is read as on the command line.
+    if place is not None:
+        place = Path(os.path.expanduser(place))
     return dataclasses.replace(config, output=place)
 
 
@@ -277,7 +289,8 @@ def read_results(directory: Path) -> SweepResults:
             f"go on with it by --resume {directory}"
         )
     with naming_damage(directory / "sweep.json"):
-        listed = record["configurations"]
-        values = [{k: x for k, x in one.items() if k != "configuration"} for one in listed]
+        # Each with its number, which here is its place in the list.
+        numbered = record["configurations"]
+        values = [{k: x for k, x in row.items() if k != "configuration"} for row in numbered]
     arrays = read_arrays(directory / "curves.npz", SweepResults._fields[2:])
     return SweepResults(directory, values, **arrays)

@@ -24,7 +24,7 @@ from mjx_reinforce.files import (
     Arrays,
     check_place,
     read_arrays,
-    remove_parts,
+    remove_leftovers,
     write_arrays,
     write_bytes,
     write_json,
@@ -32,7 +32,7 @@ from mjx_reinforce.files import (
 from mjx_reinforce.reports.charts import curves
 from mjx_reinforce.reports.experiment import lengthened
 from mjx_reinforce.runs.design import as_record
-from mjx_reinforce.runs.plan import Part, Prepared
+from mjx_reinforce.runs.plan import GroupPlan, Plan
 from mjx_reinforce.runs.sinks import Sink, open_sinks
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup.provenance import provenance
@@ -57,27 +57,34 @@ class Files(Observer[Seen]):
     #: Folders in which files are written, beside the directory itself.
     _folders: tuple[str, ...] = ()
 
-    def __init__(self, directory: Path, prepared: Prepared, say: Callable[[str], None]):
+    def __init__(self, directory: Path, plan: Plan, say: Callable[[str], None]):
         """Takes the files before they are there.
 
         Args:
           directory: where they are.
-          prepared: what the run or the sweep is made of.
+          plan: what the run or the sweep is made of.
           say: shows a line to the user.
         """
-        self._directory, self._prepared, self._say = directory, prepared, say
+        self._directory = directory
+        self._plan = plan
+        self._say = say
         self._place = directory.stat()
-        self.contents = dict(prepared.known)
-        #: What could not be written when it was last tried, and what is said of it.
+        self.contents = dict(plan.saved_record)
+        #: What could not be written when it was last tried.
         self._failing: set[str] = set()
-        self._hope = "; training goes on and tries again"
-        #: Whether the newest checkpoint is of the present state; when it was tried, and of which.
-        self._saved, self._at, self._updates = False, time.perf_counter(), 0
+        #: The end of a warning that something could not be written.
+        self._prospect = "; training goes on and tries again"
+        #: Whether the newest checkpoint is of the present state.
+        self._saved = False
+        #: When a checkpoint was last tried (s), and of how many updates.
+        self._saved_at = time.perf_counter()
+        self._saved_updates = 0
 
     def open(self) -> None:
         """Removes what a crash left of writing files."""
-        self._check_place()  # compiling took its time
-        remove_parts(self._directory, *(self._directory / name for name in self._folders))
+        # Compiling took its time, in which the directory may have been moved.
+        self._check_place()
+        remove_leftovers(self._directory, *(self._directory / name for name in self._folders))
 
     def has(self, chunk: str) -> bool:
         """Returns whether the runs of this name have ended."""
@@ -86,61 +93,74 @@ class Files(Observer[Seen]):
     def updated(self, driver: Seen, met: np.ndarray) -> None:
         """Saves if that is due; the last block is saved with its evaluation, by ``ended``."""
         self._check_place()
-        self._saved, every = False, driver.config.checkpoint_every
-        due = time.perf_counter() - self._at >= _CHECKPOINT_SECONDS
-        if every is not None:
-            due = driver.updates() - self._updates >= every
+        self._saved = False
+        num_updates = driver.config.checkpoint_every
+        if num_updates is None:
+            due = time.perf_counter() - self._saved_at >= _CHECKPOINT_SECONDS
+        else:
+            due = driver.updates() - self._saved_updates >= num_updates
         if due and not driver.record.finished():
             self._save(driver)
 
     def ended(self, driver: Seen) -> None:
         """Saves the last state, unless it is saved; nobody tries again."""
-        self._hope, self._failing = "", set()
+        self._prospect = ""
+        # Without what has failed before, so that a failure now is shown, too.
+        self._failing = set()
         if not self._saved:
             self._save(driver)
 
-    def _go_on(self, driver: Seen, found: Checkpoint | None) -> None:
+    def _go_on(self, driver: Seen, checkpoint: Checkpoint | None) -> None:
         """Takes runs to a checkpoint, if there is one, from where the next is due."""
-        if found is not None:
-            driver.restore(found)
-        self._saved = found is not None
-        self._at, self._updates = time.perf_counter(), driver.updates()
+        if checkpoint is not None:
+            driver.restore(checkpoint)
+        self._saved = checkpoint is not None
+        self._mark_saved(driver)
+
+    def _mark_saved(self, driver: Seen) -> None:
+        """Counts from now, and from these updates, to the next checkpoint."""
+        self._saved_at = time.perf_counter()
+        self._saved_updates = driver.updates()
 
     def _save(self, driver: Seen) -> None:
         """Writes a checkpoint, in case the runs are killed."""
-        self._at, self._updates = time.perf_counter(), driver.updates()
+        # Also where it fails: the next is tried no sooner than if it had not.
+        self._mark_saved(driver)
         self._saved = self._attempt("a checkpoint", lambda: self._save_checkpoint(driver))
 
     def _save_checkpoint(self, driver: Seen) -> None:
         """Writes a checkpoint, or raises OSError."""
         raise NotImplementedError
 
-    def _attempt(self, what: str, write: Callable[[], None]) -> bool:
+    def _attempt(self, name: str, write: Callable[[], None]) -> bool:
         """Returns whether something could be written; the first failure in a row is shown.
 
         Args:
-          what: is written, for the warning.
+          name: of what is written, for the warning.
           write: writes it, or raises OSError.
         """
         self._check_place()
         try:
             write()
         except OSError as error:
+            # Where the directory is gone, that is the error, and it ends the run.
             self._check_place()
-            if what not in self._failing:
+            if name not in self._failing:
                 problem = error.strerror or error
-                self._say(f"warning: cannot write {what} ({problem}){self._hope}")
-            self._failing.add(what)
+                self._say(f"warning: cannot write {name} ({problem}){self._prospect}")
+            self._failing.add(name)
             return False
-        self._failing.discard(what)
+        self._failing.discard(name)
         return True
 
     def _folder(self, *names: str) -> Path:
         """Returns a folder in the directory, which is made if it is not there."""
         folder = self._directory
+        # One after the other, and not by ``parents=True``: that would make a directory anew that
+        # was moved meanwhile.
         for name in names:
             folder /= name
-            folder.mkdir(exist_ok=True)  # not its parents: the directory is never made anew
+            folder.mkdir(exist_ok=True)
         return folder
 
     def _check_place(self) -> None:
@@ -156,10 +176,11 @@ class RunFiles(Files[Driver]):
 
     _folders = ("policy", "policy/best", "wandb")
 
-    def __init__(self, directory: Path, prepared: Prepared, say: Callable[[str], None]):
+    def __init__(self, directory: Path, plan: Plan, say: Callable[[str], None]):
         """Takes the files of a run, before they are there; arguments as of ``Files``."""
-        super().__init__(directory, prepared, say)
-        self._metrics, self._checkpoints = directory / "metrics.csv", directory / "checkpoint"
+        super().__init__(directory, plan, say)
+        self._metrics = directory / "metrics.csv"
+        self._checkpoints = directory / "checkpoint"
         #: Rows that could not be written yet.
         self._waiting = b""
         #: Where rows go besides metrics.csv.
@@ -171,18 +192,20 @@ class RunFiles(Files[Driver]):
         Raises:
           OSError: a file cannot be written.
         """
-        found, reached = self._prepared.found, None
-        self._go_on(driver, found)
+        checkpoint = self._plan.checkpoint
+        self._go_on(driver, checkpoint)
         if driver.config.resume is None:
             self._write_first(driver.config)
         else:
-            self._take_back(driver, found)
-            reached = None if found is None else driver.updates()
-            again = "" if reached else ": there is no checkpoint yet, so it begins again"
-            self._say(f"going on after {reached or 0} updates{again}")
-        # The evaluation of the present policies is made again, unless the record has it.
-        kept = reached if reached is None or driver.record.is_evaluated() else reached - 1
-        self._sinks = open_sinks(driver.config, self._directory, kept)
+            self._take_back(driver, checkpoint)
+            num_updates = driver.updates() if checkpoint is not None else 0
+            reason = "" if num_updates else ": there is no checkpoint yet, so it begins again"
+            self._say(f"going on after {num_updates} updates{reason}")
+        last_update = None
+        if checkpoint is not None:
+            # The evaluation of the present policies is made again, unless the record has it.
+            last_update = driver.updates() - (not driver.record.is_evaluated())
+        self._sinks = open_sinks(driver.config, self._directory, last_update)
 
     def _write_first(self, config: Config) -> None:
         """Writes config.json, and a metrics.csv that has no rows yet."""
@@ -191,7 +214,7 @@ class RunFiles(Files[Driver]):
         self._write_json("config.json", settings | provenance())
         write_bytes(self._metrics, HEADER)
 
-    def _take_back(self, driver: Driver, found: Checkpoint | None) -> None:
+    def _take_back(self, driver: Driver, checkpoint: Checkpoint | None) -> None:
         """Takes the files back to a checkpoint, and says in config.json that the run goes on.
 
         A crash in between leaves a run that can be resumed: config.json is first, so that the
@@ -206,14 +229,16 @@ class RunFiles(Files[Driver]):
         resumed = [*self.contents.get("resumed", []), moment]
         self._write_json("config.json", self.contents | budgets | {"resumed": resumed})
         self._write_json("summary.json", {"status": "running", **moment})
-        resume.remove_checkpoints(self._checkpoints, after=found.number if found else 0)
-        if found is None:
+        if checkpoint is None:
+            resume.remove_checkpoints(self._checkpoints, after=0)
             write_bytes(self._metrics, HEADER)
         else:
-            files.cut(self._metrics, found.metrics_bytes)
+            resume.remove_checkpoints(self._checkpoints, after=checkpoint.number)
+            files.cut(self._metrics, checkpoint.metrics_bytes)
 
     def evaluated(self, driver: Driver, evaluation: Evaluation, rows: Arrays) -> None:
         """Writes the rows of an evaluation."""
+        # Together with what a full disk did not take before, so that no row is lost.
         self._waiting += lines(rows)
         self._attempt("metrics.csv", self._write_rows)
         for sink in self._sinks:
@@ -253,7 +278,7 @@ class RunFiles(Files[Driver]):
 
     def _save_policies(self, driver: Driver) -> None:
         """Writes the last and the best policies."""
-        settings = self._prepared.parts[0].ready.policy
+        settings = self._plan.group_plans[0].ready.policy
         save_policy(self._folder("policy"), driver.states.train_states.actor, settings)
         save_policy(self._folder("policy", "best"), driver.best.actor, settings)
 
@@ -278,31 +303,34 @@ class SweepFiles(Files[Training]):
 
     _folders = ("parts",)
 
-    def __init__(self, directory: Path, prepared: Prepared, say: Callable[[str], None]):
+    def __init__(self, directory: Path, plan: Plan, say: Callable[[str], None]):
         """Takes the files of a sweep, before they are there; arguments as of ``Files``."""
-        super().__init__(directory, prepared, say)
+        super().__init__(directory, plan, say)
         self._parts = directory / "parts"
         self.contents = self._contents()
 
     def _contents(self) -> dict[str, Any]:
         """Returns what sweep.json says while the sweep goes on."""
-        design, parts, known = self._prepared.design, self._prepared.parts, self._prepared.known
+        design = self._plan.design
+        group_plans = self._plan.group_plans
+        # Times and the command of a sweep that goes on are those of its beginning.
+        saved_record = self._plan.saved_record
         return {
             "status": "running",
             "env": design.base.env,
-            "threshold": parts[0].ready.threshold,
+            "threshold": group_plans[0].ready.threshold,
             **as_record(design),
             "num_seeds": design.base.num_seeds,
             "configurations": [
                 {"configuration": number, **values}
                 for number, values in enumerate(design.configurations)
             ],
-            "chunk_runs": [part.limit for part in parts],
-            "local_devices": self._prepared.division.count,
-            "engine": parts[0].ready.engine,
-            "compile_seconds": known.get("compile_seconds", 0.0),
-            "run_seconds": known.get("run_seconds", 0.0),
-            "command": known.get("command", typed("sweep")),
+            "chunk_runs": [group_plan.limit for group_plan in group_plans],
+            "local_devices": self._plan.division.count,
+            "engine": group_plans[0].ready.engine,
+            "compile_seconds": saved_record.get("compile_seconds", 0.0),
+            "run_seconds": saved_record.get("run_seconds", 0.0),
+            "command": saved_record.get("command", typed("sweep")),
             **provenance(),
         }
 
@@ -312,7 +340,8 @@ class SweepFiles(Files[Training]):
         self._write_json("sweep.json", self.contents)
         super().open()
         self._parts.mkdir(exist_ok=True)
-        remove_parts(*self._parts.glob("*/"))  # of checkpoints
+        # The folders in parts/ are those of chunks' checkpoints.
+        remove_leftovers(*self._parts.glob("*/"))
 
     def has(self, chunk: str) -> bool:
         """Returns whether the runs of a chunk have ended."""
@@ -320,8 +349,8 @@ class SweepFiles(Files[Training]):
 
     def began(self, driver: Training) -> None:
         """Takes a chunk to its newest checkpoint, if there is one."""
-        found = resume.read_checkpoints(self._checkpoints(driver), self._say)
-        self._go_on(driver, next(found, None))
+        checkpoints = resume.read_checkpoints(self._checkpoints(driver), self._say)
+        self._go_on(driver, next(checkpoints, None))
 
     def ended(self, driver: Training) -> None:
         """Writes the part of a chunk, or a checkpoint of one that was interrupted."""
@@ -329,6 +358,8 @@ class SweepFiles(Files[Training]):
             super().ended(driver)
             return
         self._check_place()
+        # In this order: what a kill between the two leaves is a part, and checkpoints that nothing
+        # reads any more.
         self._write_part(driver)
         resume.remove_checkpoints(self._checkpoints(driver))
 
@@ -341,9 +372,11 @@ class SweepFiles(Files[Training]):
             curves = join_parts([{name: part[name] for name in _CURVES} for part in parts.values()])
             write_arrays(self._directory / "curves.npz", curves)
         if summary["status"] == "finished":
+            # What a kill at this point left is written again, as a whole.
             shutil.rmtree(self._directory / "policies", ignore_errors=True)
-            for part in self._prepared.parts:
-                self._write_policies(part, [parts[runs.name] for runs in part.chunks])
+            for group_plan in self._plan.group_plans:
+                self._write_policies(group_plan, [parts[runs.name] for runs in group_plan.chunks])
+        # Before the parts go: they can make all the files again until this says that it is over.
         self._write_json("sweep.json", summary)
         if summary["status"] == "finished":
             shutil.rmtree(self._parts)
@@ -357,47 +390,54 @@ class SweepFiles(Files[Training]):
 
     def _write_part(self, driver: Training) -> None:
         """Writes what a chunk measured, and the last policies of each configuration's ends."""
-        record, runs = driver.record, driver.runs
-        found = since_their_end(record.history()) | runs._asdict() | {"nonfinite": record.nonfinite}
-        curves = {name: found[name].astype(kind) for name, kind in _CURVES.items()}
+        runs = driver.runs
+        arrays = since_their_end(driver.record.history()) | runs._asdict()
+        arrays["nonfinite"] = driver.record.nonfinite
+        curves = {name: arrays[name].astype(kind) for name, kind in _CURVES.items()}
         last = {name: curves[name] for name in ("configuration", "seed")}
         last["eval_return"] = curves["eval_return"][-1]
-        kept = np.concatenate([_ends(last, n) for n in np.unique(runs.configuration)])
+        # The worst and the best seed of a configuration in the whole sweep are its ends in their
+        # chunks, too, so the policies of other seeds need not be stored.
+        rows = np.concatenate([_ends(last, n) for n in np.unique(runs.configuration)])
         last |= arrays_of(driver.slots.states().train_states.actor)
-        ends = {f"ends/{name}": np.asarray(x)[kept] for name, x in last.items()}
+        ends = {f"ends/{name}": np.asarray(x)[rows] for name, x in last.items()}
         write_arrays(self._parts / f"{runs.name}.npz", curves | ends)
 
-    def _write_policies(self, part: Part, chunks: Sequence[Arrays]) -> None:
+    def _write_policies(self, group_plan: GroupPlan, chunks: Sequence[Arrays]) -> None:
         """Writes the policies of the worst and the best seed of each configuration of a group.
 
         Each folder is as the directory of a run.
 
         Args:
-          part: the group.
-          chunks: what its parts have.
+          group_plan: of the group.
+          chunks: the arrays in the part of each of its chunks.
         """
         last = {
             name.removeprefix("ends/"): np.concatenate([chunk[name] for chunk in chunks])
             for name in chunks[0]
             if name not in _CURVES
         }
-        policy = part.ready.policy
-        for number in part.group.members.tolist():
-            kept = _ends(last, number)
-            ends = {name: values[kept] for name, values in last.items()}
-            seeds, returns = ends.pop("seed"), ends.pop("eval_return").astype(np.float64)
+        policy = group_plan.ready.policy
+        for number in group_plan.group.members.tolist():
+            rows = _ends(last, number)
+            ends = {name: values[rows] for name, values in last.items()}
+            seeds = ends.pop("seed")
+            returns = ends.pop("eval_return").astype(np.float64)
+            # What is left over after this are the arrays of the policies.
             del ends["configuration"]
             place = self._folder("policies", f"{number:03d}")
-            config = self._prepared.design.configs[number]
-            traced = {k: getattr(config, k) for k in part.group.settings if k in policy}
+            config = self._plan.design.configs[number]
+            # ``policy`` is that of the group's first configuration, but for these numbers.
+            traced = {k: getattr(config, k) for k in group_plan.group.settings if k in policy}
             folder = self._folder("policies", place.name, "policy")
             save_policy(folder, actor_of(ends), policy | traced)
-            ranked = {"status": "finished", "final_returns": returns.tolist()}
-            write_json(place / "summary.json", ranked)
-            run = {"env": config.env, "horizon": part.ready.horizon}
+            summary = {"status": "finished", "final_returns": returns.tolist()}
+            write_json(place / "summary.json", summary)
+            settings = {"env": config.env, "horizon": group_plan.ready.horizon}
             if config.env_set:
-                run["env_set"] = list(config.env_set)
-            write_json(place / "config.json", run | {"seeds": seeds.tolist()})
+                settings["env_set"] = list(config.env_set)
+            settings["seeds"] = seeds.tolist()
+            write_json(place / "config.json", settings)
 
 
 def _ends(last: Arrays, number: int) -> np.ndarray:
@@ -408,6 +448,7 @@ def _ends(last: Arrays, number: int) -> np.ndarray:
       number: of the configuration.
     """
     runs = np.flatnonzero(last["configuration"] == number)
+    # By the seeds' numbers, so that equal returns choose the same seeds however chunks were cut.
     runs = runs[np.argsort(last["seed"][runs])]
     values = np.nan_to_num(last["eval_return"][runs], nan=-np.inf)
     return runs[sorted({int(values.argmin()), int(values.argmax())})]
@@ -419,6 +460,8 @@ def since_their_end(history: Arrays) -> Arrays:
     It is made when all have ended; until then their rows repeat the one before. So a run has the
     same rows whatever is beside it.
     """
+    # A run that has not ended plays in every block, so env steps that stay the same say that it
+    # has; from there on ``cumsum`` keeps the mark.
     steps = history["env_steps"]
     ended = np.cumsum(steps[1:] == steps[:-1], axis=0) > 0
     return {n: np.concatenate([x[:1], np.where(ended, x[-1], x[1:])]) for n, x in history.items()}
@@ -432,8 +475,11 @@ def join_parts(parts: Sequence[Mapping[str, np.ndarray]]) -> Arrays:
     length = max(len(part["eval_return"]) for part in parts)
 
     def joined(name: str) -> np.ndarray:
-        each = [part[name] for part in parts]
-        return np.concatenate([lengthened(x, length) if x.ndim > 1 else x for x in each], axis=-1)
+        # Arrays [E, R] have a row an evaluation, arrays [R] have none.
+        arrays = [part[name] for part in parts]
+        arrays = [lengthened(x, length) if x.ndim > 1 else x for x in arrays]
+        return np.concatenate(arrays, axis=-1)
 
+    # The last key counts first.
     order = np.lexsort((joined("seed"), joined("configuration")))
     return {name: joined(name)[..., order] for name in parts[0]}

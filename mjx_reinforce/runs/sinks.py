@@ -52,11 +52,13 @@ def scalars(rows: Arrays) -> dict[str, float]:
     """
     shown = {f"progress/{name}": float(rows[name].mean()) for name in _PROGRESS}
     for name, values in measured(rows).items():
-        ends = {"lowest": values.min(), "highest": np.fmax.reduce(values), "iqm": iqm(values)}
-        if name == "eval_return":  # of thousands of resamples
-            ends["iqm_low"], ends["iqm_high"] = iqm_interval(values)
-        ends |= {f"seed_{i}": x for i, x in enumerate(values[:MAX_SINGLE_SEEDS])}
-        shown |= {f"{name}/{key}": float(x) for key, x in ends.items()}
+        # ``min`` is NaN if any seed's value is, and ``fmax`` passes over those.
+        statistics = {"lowest": values.min(), "highest": np.fmax.reduce(values), "iqm": iqm(values)}
+        # Of one column alone: an interval takes thousands of resamples.
+        if name == "eval_return":
+            statistics["iqm_low"], statistics["iqm_high"] = iqm_interval(values)
+        statistics |= {f"seed_{i}": x for i, x in enumerate(values[:MAX_SINGLE_SEEDS])}
+        shown |= {f"{name}/{key}": float(x) for key, x in statistics.items()}
     return shown
 
 
@@ -83,7 +85,9 @@ class TensorBoard:
         self._path = folder / f"events.out.tfevents.{place}"
         self._path.touch()
         self._add(file_version="brain.Event:2")
-        self._add(step=0 if updates is None else updates + 1, session_log={"status": "START"})
+        # A START makes TensorBoard drop what it has from this step on.
+        next_step = 0 if updates is None else updates + 1
+        self._add(step=next_step, session_log={"status": "START"})
 
     def write(self, rows: Arrays) -> None:
         """Adds an event, or raises OSError and adds none."""
@@ -99,9 +103,12 @@ class TensorBoard:
         from tensorboardX.record_writer import masked_crc32c
 
         proto: Any = importlib.import_module("tensorboardX.proto.event_pb2")
-        data = proto.Event(wall_time=time.time(), **fields).SerializeToString()
-        parts = (struct.pack("<Q", len(data)), data)
-        append(self._path, b"".join(x + struct.pack("<I", masked_crc32c(x)) for x in parts))
+        event = proto.Event(wall_time=time.time(), **fields).SerializeToString()
+        length = struct.pack("<Q", len(event))
+        # In one write, which ``append`` takes back if the disk is full: behind half an event
+        # nothing would be read.
+        checked = (x + struct.pack("<I", masked_crc32c(x)) for x in (length, event))
+        append(self._path, b"".join(checked))
 
 
 #: Has the id of the run.
@@ -121,8 +128,11 @@ class WeightsAndBiases:
         del updates  # W&B itself drops what it has
         import wandb
 
-        path, mode = directory / WANDB_RUN, os.environ.get("WANDB_MODE", "offline")
-        path.parent.mkdir(exist_ok=True)  # without it W&B writes elsewhere
+        path = directory / WANDB_RUN
+        mode = os.environ.get("WANDB_MODE", "offline")
+        # Without this folder W&B writes elsewhere.
+        path.parent.mkdir(exist_ok=True)
+        # The id is drawn here, and not by W&B, so that a resumed run finds it in the file.
         if not path.exists():
             write_json(path, {"id": secrets.token_hex(4)})
         with _errors_as_os_errors():

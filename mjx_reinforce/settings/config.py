@@ -64,7 +64,9 @@ class Config(
     @property
     def first_seed(self) -> int:
         """The number of the first seed."""
-        return 0 if self.seeds is None else read_seeds(self.seeds).start
+        if self.seeds is None:
+            return 0
+        return read_seeds(self.seeds).start
 
     @property
     def episodes_per_update(self) -> int:
@@ -79,8 +81,11 @@ class Config(
         Args:
           horizon: the task's own time limit.
         """
-        whole = self.horizon or horizon
-        return whole if self.whole_after < 1 else min(whole, self.train_horizon or whole)
+        limit = self.horizon or horizon
+        # Once --whole-after is reached no episode is cut, and the programs must have room for that.
+        if self.whole_after < 1 or not self.train_horizon:
+            return limit
+        return min(limit, self.train_horizon)
 
     @property
     def block_length(self) -> int:
@@ -90,9 +95,11 @@ class Config(
         an episode. A block that is shorter anyway does not depend on the budget, so that a run with
         another budget finds its programs in the compilation cache.
         """
+        # A block ends where the budget does, so none is longer than the whole run.
         bounds = [self.eval_every]
         if self.max_updates is not None:
             bounds.append(self.max_updates)
+        # An episode has one step or more, so so many updates use up the budget in any case.
         if self.env_steps is not None:
             bounds.append(-(-self.env_steps // self.episodes_per_update))
         return min(self.eval_every, max(_ALWAYS_ROOM, min(bounds)))
@@ -101,12 +108,13 @@ class Config(
 def read_seeds(text: str) -> range:
     """Returns the numbers of seeds that --seeds names, or raises ValueError."""
     first, _, end = text.partition(":")
-    numbers = [int(x) if x.isascii() and x.isdigit() else -1 for x in (first, end)]
-    if not 0 <= numbers[0] < numbers[1] <= MAX_OF_UPDATE:
+    # ``int`` alone would take signs, spaces, underscores and the digits of other scripts.
+    is_number = all(word.isascii() and word.isdigit() for word in (first, end))
+    if not (is_number and int(first) < int(end) <= MAX_OF_UPDATE):
         raise ValueError(
             f"--seeds must be FIRST:END, such as 64:128, got {text!r}; --num-seeds says how many"
         )
-    return range(*numbers)
+    return range(int(first), int(end))
 
 
 @functools.cache
@@ -134,6 +142,7 @@ def check_each(config: Config) -> None:
             f"--seeds {config.seeds} names {len(read_seeds(config.seeds))} seeds, and num_seeds is "
             f"{config.num_seeds}: make them agree"
         )
+    # Before hours of training, and not where the first row is logged.
     for name in config.log:
         _check_installed(name)
     envs.check_id(config.env)
@@ -144,8 +153,9 @@ def check_each(config: Config) -> None:
     for rule in Range:
         for name in marked(rule):
             value = getattr(config, name)
+            # None and words, such as "budget", are no numbers, and ``check_type`` let them pass.
             if not (value is None or isinstance(value, str) or rule.holds(value)):
-                raise ValueError(f"{flag(name)} must be {rule.said}, got {reprlib.repr(value)}")
+                raise ValueError(f"{flag(name)} must be {rule.words}, got {reprlib.repr(value)}")
 
 
 #: The package that each log needs.
@@ -202,20 +212,21 @@ def is_read(name: str, config: Config) -> bool:
     return all(reader.holds(config) for reader in Reader if name in marked(reader))
 
 
-def check_read(config: Config, given: Collection[str]) -> None:
+def check_read(config: Config, chosen_names: Collection[str]) -> None:
     """Raises ValueError for settings that a user gave and that nothing would read.
 
     Args:
       config: the settings.
-      given: the names of those that the user gave.
+      chosen_names: of those that the user gave.
     """
     for reader in Reader:
-        idle = [name for name in marked(reader) if name in given]
+        idle = [name for name in marked(reader) if name in chosen_names]
         if idle and not reader.holds(config):
             flags = " ".join(as_flag(name, getattr(config, name)) for name in idle)
+            pronoun = "it" if len(idle) == 1 else "them"
             raise ValueError(
-                f"{flags} would do nothing: only {reader.said} reads that; "
-                f"{'leave it out' if len(idle) == 1 else 'leave them out'}, or choose {reader.said}"
+                f"{flags} would do nothing: only {reader.words} reads that; leave {pronoun} out, "
+                f"or choose {reader.words}"
             )
 
 
@@ -227,10 +238,10 @@ def check_read_by_policy(config: Config, default: Config, policy: str) -> None:
       default: those that hold where the user gave none.
       policy: the distribution that stands for ``auto``, which depends on the environment.
     """
-    read = {name for reader in _POLICIES for name in marked(reader)}
-    check_read(
-        dataclasses.replace(config, policy=policy), read.intersection(changed(config, default))
-    )
+    policy_names = {name for reader in _POLICIES for name in marked(reader)}
+    # ``auto`` reads all of them; the distribution that it stands for may not.
+    config_of_policy = dataclasses.replace(config, policy=policy)
+    check_read(config_of_policy, policy_names.intersection(changed(config, default)))
 
 
 def changed(config: Config, default: Config) -> tuple[str, ...]:
@@ -246,7 +257,8 @@ def as_flag(name: str, value: object) -> str:
 
 def as_words(name: str, value: object) -> list[str]:
     """Returns the words of a setting on the command line; None, text, numbers or lists of them."""
-    return [flag(name), *map(str, value if isinstance(value, tuple | list) else (value,))]
+    values = value if isinstance(value, tuple | list) else (value,)
+    return [flag(name), *map(str, values)]
 
 
 #: Settings that may name code of the user's own, which runs only where the command line names it:
@@ -260,8 +272,8 @@ def code_flags(settings: Mapping[str, Any]) -> str:
     Args:
       settings: of the run; those that name no code, or are none of ``CODE``, are left out.
     """
-    own = {name: settings[name] for name in CODE if is_own(settings.get(name, ""))}
-    return "".join(f" --{name} {shlex.quote(value)}" for name, value in own.items())
+    own_code = {name: settings[name] for name in CODE if is_own(settings.get(name, ""))}
+    return "".join(f" --{name} {shlex.quote(value)}" for name, value in own_code.items())
 
 
 def check_named(
@@ -274,13 +286,15 @@ def check_named(
       named: the same as the command line says, where it does.
       directory: of the run.
     """
+    # A damaged id is refused as such, before anyone is asked to trust it.
     envs.check_id(settings["env"])
     for name in CODE:
         value = settings.get(name, "")
         if is_own(value) and named.get(name) != value:
+            # No proposal to run what is not even of the form module:name.
             check_choice(name, value, {})
-            how = "on" if name == "env" else f"with --{name}"
+            relation = "on" if name == "env" else f"with --{name}"
             raise ValueError(
-                f"{directory} was trained {how} {value}, and this would run that code; if you "
+                f"{directory} was trained {relation} {value}, and this would run that code; if you "
                 f"trust it, add{code_flags(settings)} to the command"
             )

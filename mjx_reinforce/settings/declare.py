@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 Value = TypeVar("Value")
 
-#: What is counted exactly, as a double does; see ``learners.counts``.
+#: What is counted exactly, as a double does; see ``learning.counts``.
 MAX_COUNT = 2**53
 #: The greatest of what an update counts, such as its env steps: they are int32.
 MAX_OF_UPDATE = 2**31 - 1
@@ -21,12 +21,13 @@ MAX_OF_UPDATE = 2**31 - 1
 class Range(enum.Enum):
     """What must hold of a value that is a number or numbers; checked in this order.
 
-    said: the range in words
+    words: the range, for messages
     holds: whether a value is in it
     """
 
-    def __init__(self, said: str, holds: Callable[[Any], bool]):
-        self.said, self.holds = said, holds
+    def __init__(self, words: str, holds: Callable[[Any], bool]):
+        self.words = words
+        self.holds = holds
 
     AT_LEAST_1 = "at least 1", lambda x: x >= 1
     AT_LEAST_0 = "at least 0", lambda x: x >= 0

@@ -26,13 +26,15 @@ def read_tables(name: str) -> dict[str, dict[str, Any]]:
     A table has the settings of those that it is ``like``, which stand before it, and its own.
     """
     text = Path(__file__).with_name(name).read_text("utf-8")
-    read: dict[str, dict[str, Any]] = {}
+    tables: dict[str, dict[str, Any]] = {}
     for title, table in tomllib.loads(text).items():
-        of_others = [read[other] for other in table.pop("like", ())]
-        own = {name: tuple(x) if isinstance(x, list) else x for name, x in table.items()}
-        own = {name: None if x == "None" else x for name, x in own.items()}
-        read[title] = functools.reduce(operator.or_, [*of_others, own])
-    return read
+        parents = [tables[parent] for parent in table.pop("like", ())]
+        # TOML has neither tuples nor None.
+        values = {name: tuple(x) if isinstance(x, list) else x for name, x in table.items()}
+        values = {name: None if x == "None" else x for name, x in values.items()}
+        # Of two the later one counts, and the table's own values count most.
+        tables[title] = functools.reduce(operator.or_, [*parents, values])
+    return tables
 
 
 #: name -> (a line for --help, the settings).
@@ -100,22 +102,32 @@ def of_task(
       >>> dataclasses.replace(config, num_seeds=8).num_seeds, config.env_steps
       (8, 20000)
     """
-    few = dataclasses.replace(Config(env=env, num_seeds=num_seeds), **OF_TASKS.get(env, {}))
-    config = few
-    known = MINUTES.get(env)
-    if env_steps is None and minutes is None and not known:
-        return few
-    minute = _PLENTY if env in HORIZONS else few.env_steps or 0
-    if known:  # two cores share their time among the seeds, where more is to be had
-        shared = known[0] * Config.num_seeds // min(max(num_seeds, 1), Config.num_seeds)
-        minute = known[1] if has_gpu() else min(shared, max(known))
-    time = round(minute * (1 if minutes is None else minutes))
-    budget = max(1, time) if env_steps is None else env_steps
+    smallest = dataclasses.replace(Config(env=env, num_seeds=num_seeds), **OF_TASKS.get(env, {}))
+    config = smallest
+    measured = MINUTES.get(env)
+    if env_steps is None and minutes is None and not measured:
+        return smallest
+    # Env steps of a seed in a minute. Of small tasks none are measured, for their default run is
+    # shorter; of a task of the user's own nobody knows, and the default budget stands for them.
+    if measured:
+        on_cpu, on_gpu = measured
+        # Two cores share their time among the seeds, so fewer seeds get more of it each, up to the
+        # greater of both numbers: more is of no use to the task.
+        shared = on_cpu * Config.num_seeds // min(max(num_seeds, 1), Config.num_seeds)
+        minute = on_gpu if has_gpu() else min(shared, max(measured))
+    elif env in HORIZONS:
+        minute = _PLENTY
+    else:
+        minute = smallest.env_steps or 0
+    budget = env_steps
+    if budget is None:
+        budget = max(1, round(minute * (1 if minutes is None else minutes)))
     for least, settings in OF_BUDGETS.get(env, ()):
         # On a GPU few episodes take as long as many.
         if budget >= least or (env_steps is None and has_gpu()):
-            config = dataclasses.replace(few, **settings)
+            config = dataclasses.replace(smallest, **settings)
     config = dataclasses.replace(config, env_steps=budget)
+    # After its decay a run would go on at the final learning rate, which is the lowest.
     if isinstance(config.decay_steps, int) and config.decay_steps < budget:
         config = dataclasses.replace(config, decay_steps="budget")
     if env not in HORIZONS:
@@ -129,8 +141,11 @@ def of_task(
 
 def num_cores() -> int:
     """Returns how many CPU cores this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)  # not on every system
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
+    # A container or taskset allows fewer than there are; macOS cannot say.
+    affinity = getattr(os, "sched_getaffinity", None)
+    if affinity:
+        return len(affinity(0))
+    return os.cpu_count() or 1
 
 
 def has_gpu() -> bool:
@@ -150,18 +165,23 @@ def named_code(arguments: Sequence[str]) -> dict[str, str | None]:
 
 def flag_value(arguments: Sequence[str], flag: str) -> str | None:
     """Returns what a command line gives a flag, the last time that it does; None if nothing."""
-    found = None
-    for name, following in itertools.zip_longest(arguments, arguments[1:]):
-        name, equals, value = name.partition("=")
-        if spoken(name) == flag:
-            found = value if equals else following or found
-    return found
+    flag_text = None
+    for word, following in itertools.zip_longest(arguments, arguments[1:]):
+        name, equals, text = word.partition("=")
+        # Both spellings are accepted, --env-steps and --env_steps.
+        if spoken(name) != flag:
+            continue
+        if equals:
+            flag_text = text
+        elif following:
+            flag_text = following
+    return flag_text
 
 
 def for_arguments(arguments: Sequence[str]) -> Config:
     """Returns the default settings for what a command line names: the task, seeds and budget."""
 
-    def given(flag: str, read: Callable[[str], Any]) -> Any:
+    def positive_number(flag: str, read: Callable[[str], Any]) -> Any:
         """Returns a positive number, or None, also for what the parser refuses."""
         try:
             number = read(flag_value(arguments, flag) or "")
@@ -169,6 +189,9 @@ def for_arguments(arguments: Sequence[str]) -> Config:
             return None
         return number if 0 < number < float("inf") else None
 
-    env, minutes = flag_value(arguments, "--env") or Config.env, given("--minutes", float)
-    num_seeds = given("--num-seeds", whole_number) or Config.num_seeds
-    return of_task(env, given("--env-steps", whole_number), num_seeds, minutes)
+    return of_task(
+        flag_value(arguments, "--env") or Config.env,
+        env_steps=positive_number("--env-steps", whole_number),
+        num_seeds=positive_number("--num-seeds", whole_number) or Config.num_seeds,
+        minutes=positive_number("--minutes", float),
+    )

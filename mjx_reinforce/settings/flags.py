@@ -56,10 +56,12 @@ def _reader(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
 
 def _spread(arguments: Sequence[str]) -> Iterator[str]:
     """Yields the words of a command line, layers as tyro reads them: 32,32 as 32 32, none as no."""
+    # The flag whose values the words are, until the next one comes.
     name = ""
     for word in arguments:
         if word.startswith("--"):
             name = word.partition("=")[0].replace("_", "-")
+        # Here also --hidden-sizes=32,32 falls into its words, as tyro takes several of them.
         if name in _LAYERS:
             yield from re.sub(r"[=,]|\bnone\b", " ", word, flags=re.IGNORECASE).split()
         else:
@@ -84,6 +86,7 @@ def read_command_line(
       ValueError: a word or a value is empty, which would be read as the current folder; or a flag
         has another name here.
     """
+    # Such as --output "$OUT" where OUT is unset.
     if any(not word or re.fullmatch("--[^=]+=", word) for word in arguments):
         raise ValueError("a value on the command line is empty; is a variable of the shell unset?")
     for word in arguments:
@@ -91,6 +94,7 @@ def read_command_line(
         if name in _OTHER_NAMES:
             raise ValueError(f"no flag is called {name}: write {_OTHER_NAMES[name]}")
     _give_help(form)
+    # Flags are called by a setting's name alone, not --run.env: the groups are for --help.
     options: dict[str, Any] = {"registry": _READERS, "config": (tyro.conf.OmitArgPrefixes,)}
     return tyro.cli(form, prog=prog, description=description, args=[*_spread(arguments)], **options)
 
@@ -100,14 +104,14 @@ def _give_help(form: type) -> None:
 
     Tyro would end its lines where those of the docstrings end, and wrap them besides.
     """
-    said = {
-        x.arg_name: x.description or "" for x in docstring_parser.parse_from_object(form).params
-    }
+    params = docstring_parser.parse_from_object(form).params
+    descriptions = {param.arg_name: param.description or "" for param in params}
     for field in dataclasses.fields(form):
         if dataclasses.is_dataclass(field.default):
             _give_help(type(field.default))
-        elif field.name in said:
-            help = " ".join(said[field.name].split())
+        elif field.name in descriptions:
+            help = " ".join(descriptions[field.name].split())
+            # The mapping of a field cannot be written to, so the field gets another.
             field.metadata = MappingProxyType({**field.metadata, "help": help})
 
 
@@ -136,6 +140,7 @@ def run_command(form: type[Form], name: str, do: Callable[[Form], object]) -> No
       name: of the command.
       do: what it does.
     """
+    # First of all: a message about bad input may have letters that the terminal has not.
     accept_everything()
     try:
         do(read_command_line(form, sys.argv[1:], command(name)))

@@ -18,12 +18,13 @@ class Reader(enum.Enum):
 
     A setting with several is read where all of them read; one with none always is.
 
-    said: the condition in words
+    words: the condition, for messages
     holds: whether a configuration fulfils it
     """
 
-    def __init__(self, said: str, holds: Callable[[Any], bool]):
-        self.said, self.holds = said, holds
+    def __init__(self, words: str, holds: Callable[[Any], bool]):
+        self.words = words
+        self.holds = holds
 
     # An algorithm of the user's own may read all of them.
     GRADIENT = (

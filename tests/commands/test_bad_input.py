@@ -100,7 +100,7 @@ IDLE = {
 
 @pytest.mark.parametrize("reader", Reader)
 def test_settings_that_would_do_nothing_are_refused(reader):
-    words = re.escape(f"would do nothing: only {reader.said} reads that; leave it out, or choose")
+    words = re.escape(f"would do nothing: only {reader.words} reads that; leave it out, or choose")
     with pytest.raises(ValueError, match=words):
         check_read(Config(**IDLE[reader]), IDLE[reader])
 

@@ -81,5 +81,3 @@ def test_nonsense_is_refused():
         mlp_policy(3, normal(SPACE), initializer="xavier")
     with pytest.raises(ValueError, match="at least one unit"):
         mlp_policy(1, normal(SPACE), (32, 0))
-    with pytest.raises(ValueError, match="is of an earlier version"):
-        checkpoint.build_policy({"shared_trunk": False})

@@ -15,7 +15,7 @@ def test_flags_make_a_design():
     assert list(design.over["learning_rate"]) == [0.1, 0.2]
     assert (design.base.env, design.base.discount) == ("CartPole-v1", 0.5)
     assert (design.exact, design.chunk_runs, design.base.resume) == (True, 4, None)
-    assert set(design.given) == {"discount"}
+    assert set(design.chosen_names) == {"discount"}
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 
 from mjx_reinforce.runs import design, plan
 from mjx_reinforce.runs.design import Design
-from mjx_reinforce.runs.plan import Group, describe, make_groups, prepare
+from mjx_reinforce.runs.plan import Group, describe, make_groups, make_plan
 from mjx_reinforce.settings.config import Config
 
 CONFIG = Config(env_steps=1000, max_updates=7, num_seeds=3, num_episodes=16)
@@ -128,25 +128,26 @@ OVER = {"num_episodes": [2, 4], "learning_rate": [1e-3, 1e-2, 1e-1]}
 
 
 def prepared(base=BASE, known=MappingProxyType({}), **changes):
-    return prepare(Design(base=base, over=OVER, **changes), known, None, pytest.fail)
+    return make_plan(Design(base=base, over=OVER, **changes), known, None, pytest.fail)
 
 
 def test_a_group_is_what_shares_its_programs():
     sweep = prepared()
-    groups = [part.group for part in sweep.parts]
+    groups = [group_plan.group for group_plan in sweep.group_plans]
     assert [group.members.tolist() for group in groups] == [[0, 1, 2], [3, 4, 5]]
     assert [group.config.num_episodes for group in groups] == [2, 4]
     assert groups[1].settings["learning_rate"].tolist() == [1e-3, 1e-2, 1e-1]
-    assert [part.ready.horizon for part in sweep.parts] == [50, 50]
+    assert [group_plan.ready.horizon for group_plan in sweep.group_plans] == [50, 50]
     assert describe(sweep).startswith("Training 6 configurations of 3 seeds of Cont")
 
 
 def test_a_chunk_has_as_many_runs_as_asked_or_as_it_had(monkeypatch, tmp_path):
-    assert [part.limit for part in prepared(chunk_runs=4).parts] == [4, 4]
+    assert [group_plan.limit for group_plan in prepared(chunk_runs=4).group_plans] == [4, 4]
     known = {"chunk_runs": [2, 9], "local_devices": 1}
     monkeypatch.setattr(plan.resume, "check_same_program", lambda *given: None)
     base = dataclasses.replace(BASE, resume=tmp_path)
-    assert [part.limit for part in prepared(base, known, chunk_runs=4).parts] == [2, 9]
+    group_plans = prepared(base, known, chunk_runs=4).group_plans
+    assert [group_plan.limit for group_plan in group_plans] == [2, 9]
     known["local_devices"] = 3
     with pytest.raises(ValueError, match="was begun on 3 devices, and here are 1"):
         prepared(base, known)
@@ -155,7 +156,7 @@ def test_a_chunk_has_as_many_runs_as_asked_or_as_it_had(monkeypatch, tmp_path):
 def test_exact_sweeps_have_one_device_and_trace_every_number():
     sweep = prepared(exact=True)
     assert sweep.division.count == 1
-    assert len(sweep.parts[0].group.settings) > 5
+    assert len(sweep.group_plans[0].group.settings) > 5
 
 
 def test_a_task_that_refuses_its_settings():

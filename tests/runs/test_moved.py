@@ -8,7 +8,7 @@ import pytest
 
 from mjx_reinforce import train
 from mjx_reinforce.report import WrittenReport
-from mjx_reinforce.runs import command_line, plan, saving
+from mjx_reinforce.runs import command_line, perform, plan, saving
 from mjx_reinforce.runs.saving import Files, RunFiles, SweepFiles
 from mjx_reinforce.training import driver
 
@@ -75,7 +75,7 @@ def test_it_ends_while_it_trains(run, monkeypatch, capsys, command, loss):
 def test_it_ends_before_it_trains(run, monkeypatch, capsys, command):
     """Where another run began in its place while this one wrote its simulation out."""
     main, arguments = COMMANDS[command]
-    lose(monkeypatch, plan, "prepare", 1, replace)
+    lose(monkeypatch, plan, "make_plan", 1, replace)
     check_lost(run(*arguments, command=main), "replaced", capsys)
 
 
@@ -119,5 +119,5 @@ def test_a_report_that_is_being_written(run, monkeypatch, capsys):
         (directory / "report.html").write_text("page")
         return WrittenReport(0.0, [], 0)
 
-    monkeypatch.setattr(command_line, "_report", report)
+    monkeypatch.setattr(perform, "_report", report)
     check_lost(run(*SWEEP, command=command_line.sweep), "moved", capsys)

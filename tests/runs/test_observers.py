@@ -42,9 +42,9 @@ class Run:
 def watched(tmp_path, monkeypatch):
     """The files of a run that has begun, what is written, what cannot be, what it said, the run."""
     written, full, said, run = [], set(), [], Run()
-    part = SimpleNamespace(ready=SimpleNamespace(policy={"policy": "normal"}))
-    prepared = SimpleNamespace(known={}, found=None, parts=[part])
-    files = RunFiles(tmp_path, prepared, said.append)
+    group_plan = SimpleNamespace(ready=SimpleNamespace(policy={"policy": "normal"}))
+    plan = SimpleNamespace(saved_record={}, checkpoint=None, group_plans=[group_plan])
+    files = RunFiles(tmp_path, plan, said.append)
     files.began(run)
     assert {path.name for path in tmp_path.iterdir()} == {"config.json", "metrics.csv"}
 
@@ -86,7 +86,7 @@ def test_a_checkpoint_is_written_once_there_were_enough_updates(watched):
 
 def test_a_checkpoint_is_due_after_a_minute(watched, monkeypatch):
     files, written, _, _, run = watched
-    run.config, now = Config(num_seeds=2, checkpoint_every=None), [files._at]
+    run.config, now = Config(num_seeds=2, checkpoint_every=None), [files._saved_at]
     monkeypatch.setattr(saving.time, "perf_counter", lambda: now[0])
     for passed, expected in ((59.0, []), (1.0, saved(10**9)), (59.0, saved(10**9))):
         now[0] += passed

@@ -151,7 +151,7 @@ def test_what_does_not_fit_into_memory_is_refused_before_it_runs(
 
 def described(config):
     """What is said of a run."""
-    return plan.describe(plan.prepare(Design(base=config), {}, Survive(), pytest.fail))
+    return plan.describe(plan.make_plan(Design(base=config), {}, Survive(), pytest.fail))
 
 
 def test_a_plan_says_what_is_known(monkeypatch):
@@ -176,7 +176,7 @@ def test_a_plan_says_how_many_devices_compute(monkeypatch, seeds, episodes, said
     config = Config(num_seeds=seeds, num_episodes=episodes)
     division = plan.divide_run(config)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert plan._where(division) == said
+    assert plan._describe_devices(division) == said
 
 
 def test_alarms_are_silenced_for_the_command_line_alone(run, monkeypatch):

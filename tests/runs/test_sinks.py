@@ -42,9 +42,9 @@ def begin(directory, config):
     """Begins a run in a directory, or goes on without a checkpoint."""
     record = SimpleNamespace(env_steps=np.zeros(1))
     run = SimpleNamespace(config=config, updates=lambda: 0, record=record)
-    part = SimpleNamespace(ready=SimpleNamespace(policy={}))
-    prepared = SimpleNamespace(known={}, found=None, parts=[part])
-    files = RunFiles(directory, prepared, lambda text: None)
+    group_plan = SimpleNamespace(ready=SimpleNamespace(policy={}))
+    plan = SimpleNamespace(saved_record={}, checkpoint=None, group_plans=[group_plan])
+    files = RunFiles(directory, plan, lambda text: None)
     files.open()
     files.began(run)
 

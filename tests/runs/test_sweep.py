@@ -24,7 +24,7 @@ from mjx_reinforce.export.policy_files import load_seed
 from mjx_reinforce.export.run_files import choose_seed, read_run
 from mjx_reinforce.report import WrittenReport
 from mjx_reinforce.reports.experiment import lengthened
-from mjx_reinforce.runs import command_line, conduct, plan
+from mjx_reinforce.runs import command_line, conduct, perform, plan
 from mjx_reinforce.runs.design import Design, check_design, read_design
 from mjx_reinforce.runs.plan import make_groups
 from mjx_reinforce.runs.results import read_results
@@ -49,7 +49,7 @@ RATES = "--over learning-rate 1e-2 3e-2 1e-1"
 @pytest.fixture
 def run(run, monkeypatch):
     """Runs a sweep of arguments in one string; the report has tests of its own."""
-    monkeypatch.setattr(command_line, "_report", lambda directory: WrittenReport(0.0, [], 0))
+    monkeypatch.setattr(perform, "_report", lambda directory: WrittenReport(0.0, [], 0))
     return lambda line, command=command_line.sweep: run(*line.split(), command=command)
 
 
@@ -196,7 +196,7 @@ def whole(tmp_path_factory):
     """A sweep of chunks that nothing stopped."""
     directory = tmp_path_factory.mktemp("sweep")
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(directory), added_environments():
-        patch.setattr(command_line, "_report", lambda directory: WrittenReport(0.0, [], 0))
+        patch.setattr(perform, "_report", lambda directory: WrittenReport(0.0, [], 0))
         patch.setattr(plan, "_CPU_EPISODES", 16)
         assert run_command(*CHUNKS.split(), "--output", "whole", command=command_line.sweep) == 0
     return directory / "whole"
@@ -316,9 +316,7 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
     assert said.count("warning: cannot write a checkpoint (No space left on device)") == 2
     assert same(curves(whole), curves(Path("parts")))
     reported, written = [], WrittenReport(1.0, [], 0)
-    monkeypatch.setattr(
-        command_line, "_report", lambda directory: reported.append(directory) or written
-    )
+    monkeypatch.setattr(perform, "_report", lambda directory: reported.append(directory) or written)
     assert run("--resume parts") == 0  # killed before the report was written
     assert reported == [Path("parts")]
     Path("parts/report.html").touch()
@@ -392,7 +390,7 @@ def test_what_a_kill_left_of_a_report_goes(tmp_path, monkeypatch):
         path.write_text("half")
     nothing = WrittenReport(0.0, [], 0)
     monkeypatch.setattr("mjx_reinforce.report.write_report", lambda chosen, output: nothing)
-    assert command_line._report(tmp_path) == nothing
+    assert perform._report(tmp_path) == nothing
     assert not any(path.exists() for path in left)
 
 
@@ -470,7 +468,7 @@ def test_a_flag_that_one_configuration_reads_is_accepted():
 @pytest.mark.slow
 def test_from_python_it_is_reported_on(register, monkeypatch, tmp_path, capsys):
     written = WrittenReport(1.5, ["The best is learning rate 0.03.", "It is sure."], 1)
-    monkeypatch.setattr(command_line, "_report", lambda directory: written)
+    monkeypatch.setattr(perform, "_report", lambda directory: written)
     base = Config(
         env="Drift-v0", num_seeds=2, num_episodes=4, eval_episodes=2, env_steps=None, max_updates=2
     )

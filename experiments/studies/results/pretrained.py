@@ -113,8 +113,8 @@ def _provenance(best: Candidate, returns: np.ndarray) -> dict[str, Any]:
     mean, spread = float(np.mean(returns)), float(stats.sem(returns))
     half = spread * float(stats.t.ppf(0.975, len(returns) - 1))
     device = written["device"]
-    if device == "cpu":  # a run of an older version does not name it
-        device = written.get("cpu", "unknown CPU").split(",")[0]
+    if device == "cpu":
+        device = written["cpu"].split(",")[0]
     return {
         "task": best.run.env,
         "return": round(mean, 2),

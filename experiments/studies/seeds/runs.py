@@ -15,9 +15,8 @@ from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.files import read_arrays, read_json, write_arrays
 from mjx_reinforce.learning.policy import MLP
-from mjx_reinforce.runs.command_line import report_on
 from mjx_reinforce.runs.design import Design, read_design
-from mjx_reinforce.runs.perform import perform
+from mjx_reinforce.runs.perform import perform, report_on
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics.survival import time_to_threshold
 
