@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 Value = TypeVar("Value")
 
-#: What is counted exactly, as a double does; see ``learners.counts``.
+#: What is counted exactly, as a double does; see ``learning.counts``.
 MAX_COUNT = 2**53
 #: The greatest of what an update counts, such as its env steps: they are int32.
 MAX_OF_UPDATE = 2**31 - 1
