@@ -15,7 +15,7 @@ from mjx_reinforce.console.streams import silence_alarms
 from mjx_reinforce.engine.checks import explain
 from mjx_reinforce.engine.vector.pictures import check_drawing
 from mjx_reinforce.export.films import Take, gif, side_by_side, with_sky
-from mjx_reinforce.export.run_files import Run, SeedChoice, Which, choose_seed, read_run
+from mjx_reinforce.export.run_files import PolicyChoice, Run, SeedChoice, choose_seed, read_run
 from mjx_reinforce.files import check_output, write_bytes
 from mjx_reinforce.settings.config import check_named
 from mjx_reinforce.settings.flags import run_command
@@ -43,7 +43,7 @@ class WatchSettings:
     """Your own distribution that the run was trained with, module:name."""
     seed: SeedChoice = "best"
     """Seed that plays: best, worst or median by its final evaluation, or a number."""
-    which: Which = "last"
+    which: PolicyChoice = "last"
     """The policy at the end of training (last), or the best at any evaluation, if it was kept."""
     beside: Literal["untrained"] | None = None
     """Show the policy before training on the left, from the same start."""

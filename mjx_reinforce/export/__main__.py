@@ -5,7 +5,7 @@ from pathlib import Path
 
 import tyro
 
-from mjx_reinforce.export.run_files import Run, SeedChoice, Which, read_run
+from mjx_reinforce.export.run_files import PolicyChoice, Run, SeedChoice, read_run
 from mjx_reinforce.files import check_module, check_output
 from mjx_reinforce.settings.flags import run_command
 
@@ -18,7 +18,7 @@ class ExportSettings:
     """A run directory, or a task whose trained policy comes with the package."""
     seed: SeedChoice = "best"
     """Seed to export: best, worst or median by its final evaluation, or a number."""
-    which: Which = "last"
+    which: PolicyChoice = "last"
     """The policy at the end of training (last), or the best at any evaluation, if it was kept."""
     output: Path | None = None
     """The archive, .npz. By default seed_NUMBER in the run directory, or the name of the task in

@@ -45,16 +45,20 @@ def numpy_policy(
     Raises:
       ValueError: the family of its distribution is not in ``HEADS``.
     """
-    family, normalizer = saved.settings["policy"], saved.actor.normalizer
+    family = saved.settings["policy"]
     check_name("policy for export", family, HEADS)
+    head = HEADS[family]
     params = saved.actor.params["network"]["params"]
-    layers = [params[f"Dense_{i}"] for i in range(len(params))]
-    layers = [(np.asarray(x["kernel"]), np.asarray(x["bias"])) for x in layers]
-    middle, half, arrays = _ending(HEADS[family], saved.settings)
+    dense = [params[f"Dense_{i}"] for i in range(len(params))]
+    layers = [(np.asarray(x["kernel"]), np.asarray(x["bias"])) for x in dense]
+    middle, half, arrays = _ending(head, saved.settings)
     # Further columns are standard deviations, which the mode does not need.
     weight, bias = (x[..., : len(half)].astype(np.float64) for x in layers[-1])
+    # In float64, so that an entry is rounded once, at the end.
     layers[-1] = weight * half, bias * half + middle
     lines = []
+    # A policy that was trained without scaled observations has a normalizer that counted nothing.
+    normalizer = saved.actor.normalizer
     if normalizer.count > 0:
         arrays |= {"mean": normalizer.mean, "std": normalize.standard_deviation(normalizer)}
         scaled = '(x - P["mean"]) / P["std"]'
@@ -62,13 +66,17 @@ def numpy_policy(
     for i, (weight, bias) in enumerate(layers):
         arrays |= {f"weight_{i}": weight, f"bias_{i}": bias}
         layer = f'x @ P["weight_{i}"] + P["bias_{i}"]'
-        lines.append(f"x = np.tanh({layer})" if i < len(layers) - 1 else f"x = {layer}")
-    lines.append(f"return {_ENDINGS[HEADS[family]]}")
-    size, out = len(layers[0][0]), len(half)
-    shapes = f"[{size}] -> [{out}], or [N, {size}] -> [N, {out}]"
-    if HEADS[family] == "argmax":
-        shapes = f"[{size}] -> an integer, or [N, {size}] -> [N]"
-    if HEADS[family] == "clip":
+        # The last layer is linear; its nonlinearity is in the ending.
+        if i < len(layers) - 1:
+            layer = f"np.tanh({layer})"
+        lines.append(f"x = {layer}")
+    lines.append(f"return {_ENDINGS[head]}")
+    inputs = len(layers[0][0])
+    outputs = len(half)
+    shapes = f"[{inputs}] -> [{outputs}], or [N, {inputs}] -> [N, {outputs}]"
+    if head == "argmax":
+        shapes = f"[{inputs}] -> an integer, or [N, {inputs}] -> [N]"
+    if head == "clip":
         shapes += "\n\nActions are clipped to the range that the environment declared."
     template = Path(__file__).with_name("numpy_policy.txt").read_text("utf-8")
     body = "\n    ".join(lines)
@@ -77,7 +85,7 @@ def numpy_policy(
 
 
 def _ending(head: str, settings: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
-    """Returns what the last layer is multiplied by, what is added, and the arrays of the head.
+    """Returns what is added to the last layer, what it is multiplied by, and the head's arrays.
 
     Args:
       head: one of ``HEADS``.
@@ -93,6 +101,7 @@ def _ending(head: str, settings: dict[str, Any]) -> tuple[np.ndarray, np.ndarray
     means = gaussian_outputs(settings["policy"], space, "parameter", 1.0, rescale)
     if head == "clip":
         return means.middle, means.half, {"low": space.low, "high": space.high}
+    # The mode is middle + half * tanh((mean - middle) / half): the fraction joins the last layer.
     middle, half = middle_and_half_range(space)
-    extra = {"middle": middle, "half": half}
-    return (means.middle - middle) / half, means.half / half, extra
+    arrays = {"middle": middle, "half": half}
+    return (means.middle - middle) / half, means.half / half, arrays

@@ -24,10 +24,16 @@ def with_sky(spec: "MjSpec") -> Any:
     mujoco = import_mujoco()
     sky = mujoco.mjtTexture.mjTEXTURE_SKYBOX
     if not any(texture.type == sky for texture in spec.textures):
-        gradient = {"builtin": mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, "width": 64, "height": 384}
-        overhead, horizon = (0.30, 0.50, 0.72), (0.86, 0.91, 0.95)
-        name = "mjx_reinforce_sky"
-        spec.add_texture(name=name, type=sky, rgb1=overhead, rgb2=horizon, **gradient)
+        # The six faces of the sky's cube lie below each other: six times as high as wide.
+        spec.add_texture(
+            name="mjx_reinforce_sky",
+            type=sky,
+            builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+            rgb1=(0.30, 0.50, 0.72),  # overhead
+            rgb2=(0.86, 0.91, 0.95),  # at the horizon
+            width=64,
+            height=384,
+        )
     with warnings.catch_warnings(action="ignore"):  # what MuJoCo deprecates in a model
         return spec.compile()
 
@@ -35,8 +41,12 @@ def with_sky(spec: "MjSpec") -> Any:
 #: Frames a second at most: what a film shows, and what GIF viewers play.
 MAX_RATE = 30
 #: Heights of the strip that the words stand in, and of the words, in heights of the picture.
-_STRIP, _WORDS, _LEAST = 1 / 13, 1 / 19, 10
-_INK, _PAPER = (235, 240, 245), (28, 38, 48)
+_STRIP = 1 / 13
+_WORDS = 1 / 19
+#: The least height of words, in pixels.
+_LEAST = 10
+_INK = (235, 240, 245)
+_PAPER = (28, 38, 48)
 
 
 class Take(NamedTuple):
@@ -93,9 +103,12 @@ def side_by_side(
     """
     if not takes:
         raise ValueError("a video needs at least one take")
+    # A frame every few env steps of the slowest take, so that motion is even: as many as keep
+    # within the rate. The small numbers here are rounding, by which a frame more would begin.
     dt = max(take.dt for take in takes)
     interval = dt * max(1, math.ceil(1 / (dt * max_rate) - 1e-9))
-    lasting = max(min(len(take.qpos) * take.dt, seconds) for take in takes)
+    duration = max(min(len(take.qpos) * take.dt, seconds) for take in takes)
+    # Drawn frame by frame: all pictures of a long film would not fit into memory.
     renderers = [Renderer(take.model, width, height) for take in takes]
 
     def draw(frame: int) -> np.ndarray:
@@ -105,35 +118,37 @@ def side_by_side(
         ]
         return np.concatenate(pictures, axis=1)
 
-    length = max(1, math.ceil(lasting / interval - 1e-6))
+    length = max(1, math.ceil(duration / interval - 1e-6))
     samples = [*range(0, length, -(-length // SAMPLES))]
     return Film(1 / interval, length, samples, draw)
 
 
 def _picture(take: Take, renderer: Renderer, seconds: float) -> np.ndarray:
     """Returns a take's picture at a time (s)."""
+    # A take that ended keeps its last position.
     step = min(int(seconds / take.dt + 1e-6), len(take.qpos) - 1)
     picture = renderer.draw(take.qpos[step])
-    total, time = np.sum(take.rewards[:step]), step * take.dt
-    earned = f"{total:,.0f}" if abs(total) >= 100 else f"{total:.1f}"
-    return caption(picture, take.label, f"return {earned}   {time:4.1f} s")
+    total = np.sum(take.rewards[:step])
+    digits = 0 if abs(total) >= 100 else 1
+    return caption(picture, take.label, f"return {total:,.{digits}f}   {step * take.dt:4.1f} s")
 
 
-def caption(picture: np.ndarray, left: str, right: str) -> np.ndarray:
-    """Returns a picture [H, W, 3] uint8 with a strip below it that says two things."""
+def caption(picture: np.ndarray, label: str, note: str) -> np.ndarray:
+    """Returns a picture [H, W, 3] uint8 above a strip with a label on the left, a note right."""
     from PIL import Image, ImageDraw
 
     height, width = picture.shape[:2]
     strip = max(_LEAST + 2, 2 * round(height * _STRIP / 2))
-    font, small = (_font(max(_LEAST, round(height * x))) for x in (_WORDS, _WORDS * 0.8))
+    font = _font(max(_LEAST, round(height * _WORDS)))
     image = Image.new("RGB", (width, height + strip), _PAPER)
     image.paste(Image.fromarray(picture))
     draw = ImageDraw.Draw(image)
-    if draw.textlength(left + right, font) > width - 3 * strip // 2:
-        font = small
+    # With a gap between the two, and the margins at the ends, they would not fit.
+    if draw.textlength(label + note, font) > width - 3 * strip // 2:
+        font = _font(max(_LEAST, round(height * _WORDS * 0.8)))
     middle = height + strip // 2
-    draw.text((strip // 3, middle), left, fill=_INK, font=font, anchor="lm")
-    draw.text((width - strip // 3, middle), right, fill=_INK, font=font, anchor="rm")
+    draw.text((strip // 3, middle), label, fill=_INK, font=font, anchor="lm")
+    draw.text((width - strip // 3, middle), note, fill=_INK, font=font, anchor="rm")
     return np.asarray(image)
 
 
@@ -157,9 +172,12 @@ def gif(
     """
     from PIL import Image
 
-    sample, dither = Image.fromarray(np.concatenate(samples)), Image.Dither.NONE
-    palette = sample.quantize(colors, dither=dither)
-    drawn = (Image.fromarray(x).quantize(palette=palette, dither=dither) for x in frames)
-    film, looks = io.BytesIO(), {"duration": 1000 / rate, "loop": 0, "optimize": True}
-    next(drawn).save(film, "GIF", save_all=True, append_images=drawn, **looks)
-    return film.getvalue()
+    # Dithering would differ from frame to frame: it flickers, and does not compress.
+    dither = Image.Dither.NONE
+    palette = Image.fromarray(np.concatenate(samples)).quantize(colors, dither=dither)
+    images = (Image.fromarray(x).quantize(palette=palette, dither=dither) for x in frames)
+    file = io.BytesIO()
+    # Milliseconds a frame; 0 rounds are rounds without end.
+    options = {"duration": 1000 / rate, "loop": 0, "optimize": True}
+    next(images).save(file, "GIF", save_all=True, append_images=images, **options)
+    return file.getvalue()

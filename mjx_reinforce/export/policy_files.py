@@ -17,9 +17,9 @@ from flax import serialization, traverse_util
 from mjx_reinforce.engine.base import Box, Discrete
 from mjx_reinforce.engine.checks import check_kind, check_type, explain
 from mjx_reinforce.export.run_files import (
+    PolicyChoice,
     Run,
     SeedChoice,
-    Which,
     choose_seed,
     policy_folder,
     read_run,
@@ -131,17 +131,20 @@ def load_policy(directory: str | Path, seed: int | None = None) -> tuple[Policy,
 
 
 def read_policy(
-    directory: str | Path, seed: int | None = None, own: str | None = None
+    directory: str | Path, seed: int | None = None, trusted_code: str | None = None
 ) -> SavedPolicy:
     """Reads what ``save_policy`` wrote, as ``load_policy``, with all that it says.
 
     Args:
       directory: as ``load_policy``.
       seed: as ``load_policy``.
-      own: "module:name" of a distribution that may be imported; what only a file names is not.
+      trusted_code: "module:name" of a distribution that may be imported; what only a file names is
+        not.
     """
-    settings_path, actor_path = Path(directory) / "policy.json", Path(directory) / "actor.npz"
-    settings, arrays = read_json(settings_path), read_arrays(actor_path, stored=True)
+    settings_path = Path(directory) / "policy.json"
+    actor_path = Path(directory) / "actor.npz"
+    settings = read_json(settings_path)
+    arrays = read_arrays(actor_path, stored=True)
     # The checksum finds damage, not ill will: who changes the files can compute it again.
     if arrays.pop(_CHECKSUM, None) != _checksum(settings, arrays):
         raise ValueError(
@@ -150,7 +153,8 @@ def read_policy(
         )
     with naming_damage(settings_path):
         check_choice("policy", settings["policy"], DISTRIBUTIONS)
-    if is_own(settings["policy"]) and settings["policy"] != own:
+    # A run may be a stranger's. Code runs only if the user names it, not because a file does.
+    if is_own(settings["policy"]) and settings["policy"] != trusted_code:
         raise ValueError(
             f"{settings_path} names the distribution {settings['policy']}, and this would run that "
             f"code; if you trust it, add --policy {settings['policy']} to watch, or give "
@@ -158,17 +162,23 @@ def read_policy(
         )
     with naming_damage(settings_path):
         policy = played_policy(settings)
+        # Traced, not computed: the shapes are known in milliseconds.
         shapes = arrays_of(jax.eval_shape(functools.partial(_untrained, policy, settings)))
     with naming_damage(actor_path):
         num_seeds = _check_shapes(arrays, shapes)
     if seed is not None and not 0 <= seed < num_seeds:
-        seeds = f"its seeds are 0 to {num_seeds - 1}" if num_seeds > 1 else "it has seed 0 alone"
+        seeds = "it has seed 0 alone"
+        if num_seeds > 1:
+            seeds = f"its seeds are 0 to {num_seeds - 1}"
         raise ValueError(f"{directory} has no seed {seed}: {seeds}")
     with np.errstate(over="ignore"):  # a double that no float32 holds becomes infinite
         arrays = {k: x.astype(jax.dtypes.canonicalize_dtype(x.dtype)) for k, x in arrays.items()}
+    # Of one seed, others may be broken.
     with naming_damage(actor_path):
         _check_finite(arrays, seed)
-    actor = jax.tree.map(lambda x: jnp.asarray(x if seed is None else x[seed]), actor_of(arrays))
+    if seed is not None:
+        arrays = {name: array[seed] for name, array in arrays.items()}
+    actor = jax.tree.map(jnp.asarray, actor_of(arrays))
     return SavedPolicy(policy, actor, settings, num_seeds)
 
 
@@ -189,14 +199,17 @@ def _check_shapes(arrays: Arrays, expected: dict[str, Any]) -> int:
       ValueError: they are not those, or not of the same number of seeds.
     """
     for name in sorted(arrays.keys() ^ expected.keys()):
-        what = "is missing" if name in expected else "is in no policy of these settings"
-        raise ValueError(f"{name} {what}")
+        if name in expected:
+            raise ValueError(f"{name} is missing")
+        raise ValueError(f"{name} is in no policy of these settings")
+    # Damaged, the count may have no axis of seeds; its own shape is found wrong below.
     num_seeds = max((*arrays["normalizer/count"].shape[:1], 1))
     for name, array in sorted(arrays.items()):
-        shape, kind = (num_seeds, *expected[name].shape), expected[name].dtype
+        shape = (num_seeds, *expected[name].shape)
+        kind = expected[name].dtype
         # JAX has neither numbers of other machines' byte order nor longer ones than float64.
-        usual = array.dtype.isnative and array.dtype.itemsize <= np.dtype(float).itemsize
-        if array.shape != shape or array.dtype.kind != np.dtype(kind).kind or not usual:
+        readable = array.dtype.isnative and array.dtype.itemsize <= np.dtype(float).itemsize
+        if array.shape != shape or array.dtype.kind != np.dtype(kind).kind or not readable:
             raise ValueError(
                 f"{name} is {array.dtype}{list(array.shape)}, and the settings in policy.json make "
                 f"it {kind}{list(shape)}"
@@ -207,7 +220,10 @@ def _check_shapes(arrays: Arrays, expected: dict[str, Any]) -> int:
 def _check_finite(arrays: Arrays, seed: int | None) -> None:
     """Raises ValueError for numbers that are not finite, of one seed or, if None, of any."""
     for name in sorted(arrays):
-        for s in range(len(arrays[name])) if seed is None else (seed,):
+        seeds = [seed]
+        if seed is None:
+            seeds = range(len(arrays[name]))
+        for s in seeds:
             if not np.isfinite(arrays[name][s]).all():
                 raise ValueError(f"{name} of seed {s} has numbers that are not finite")
 
@@ -229,6 +245,7 @@ def _checksum(settings: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:
     It is kept in the archive: a run that goes on replaces that file at once, and a kill between
     the two files leaves a pair that fits.
     """
+    # Keys are sorted, because a reader of JSON may keep another order than the writer.
     checksum = hashlib.sha256(json.dumps(finite(settings), default=str, sort_keys=True).encode())
     for name in sorted(arrays):
         checksum.update(name.encode() + np.ascontiguousarray(arrays[name]).tobytes())
@@ -249,6 +266,7 @@ def build_policy(settings: dict[str, Any]) -> Policy:
         arguments["initial_std"] = std if np.ptp(std) > 0 else float(std[0])
     try:
         distribution = make(space, **arguments)
+    # Other people's code may raise anything, and even leave the program.
     except (Exception, SystemExit) as error:
         if not is_own(family):
             raise
@@ -335,13 +353,19 @@ class Player(NamedTuple):
         if rng is None:
             action = _mode(self.policy, self.actor, observation)
         else:
+            # NumPy's generator gives the seed of JAX's, so that a caller needs no key.
             key = jax.random.key(int(rng.integers(2**32)))
             action = _sample(self.policy, self.actor, observation, key)
+        # Gymnasium's Discrete takes an int. A copy is writable, which JAX's array is not.
         return np.array(action) if action.ndim else int(action)
 
 
 def load(
-    run: str | Path, seed: SeedChoice = "best", *, which: Which = "last", policy: str | None = None
+    run: str | Path,
+    seed: SeedChoice = "best",
+    *,
+    which: PolicyChoice = "last",
+    policy: str | None = None,
 ) -> Player:
     """Loads a trained policy to play, in Gymnasium or elsewhere.
 
@@ -370,11 +394,13 @@ def load(
 
 
 def load_seed(
-    run: Run, seed: SeedChoice, which: Which = "last", policy: str | None = None
+    run: Run, seed: SeedChoice, choice: PolicyChoice = "last", trusted_code: str | None = None
 ) -> tuple[Player, SavedPolicy]:
     """Loads one seed, as ``load``, with what its files say."""
-    folder, number = policy_folder(run, which), choose_seed(run, seed, which)
-    saved = read_policy(folder, run.place(number), policy)
+    folder = policy_folder(run, choice)
+    number = choose_seed(run, seed, choice)
+    saved = read_policy(folder, run.place(number), trusted_code)
+    # A policy that was copied into another run's folder may fit its shapes by chance.
     if saved.settings.get("env", run.env) != run.env:
         raise ValueError(
             f"{folder / 'policy.json'} is for {saved.settings['env']}, "

@@ -17,10 +17,20 @@ from mjx_reinforce.settings.config import read_seeds
 #: A seed by its rank in the run's final evaluation, or by its number.
 SeedChoice = Literal["best", "worst", "median"] | int
 #: Each seed's policy at the end of training, or the one that did best on the way.
-Which = Literal["last", "best"]
+PolicyChoice = Literal["last", "best"]
 
-#: Where the policies are in the run directory, and their returns in summary.json.
-_PLACES = {"last": ("policy", "final_returns"), "best": ("policy/best", "best_test_returns")}
+
+class _Places(NamedTuple):
+    """Where the policies are in the run directory, and their returns in summary.json."""
+
+    folder: str
+    returns: str
+
+
+_PLACES = {
+    "last": _Places("policy", "final_returns"),
+    "best": _Places("policy/best", "best_test_returns"),
+}
 #: The entries of config.json that are read, and their types.
 _KINDS = {"env": str, "horizon": int, "seeds": tuple[int, ...] | None, "env_set": tuple[str, ...]}
 _NOT_YET = "its training is still running, or was killed: train --resume continues it"
@@ -49,8 +59,8 @@ class Run(NamedTuple):
         if self.seeds is None:
             return seed
         if seed not in self.seeds:
-            kept = " and ".join(map(str, self.seeds))
-            raise ValueError(f"{self.directory} has the policies of the seeds {kept}, not {seed}")
+            seeds = " and ".join(map(str, self.seeds))
+            raise ValueError(f"{self.directory} has the policies of the seeds {seeds}, not {seed}")
         return self.seeds.index(seed)
 
 
@@ -62,7 +72,8 @@ def read_run(directory: str | Path) -> Run:
     """
     directory = Path(os.path.expanduser(directory))
     if str(directory) in pretrained() and not directory.exists():
-        name, facts = str(directory), provenance_of(str(directory))
+        name = str(directory)
+        facts = provenance_of(name)
         return Run(FOLDER / name, name, facts["horizon"], (facts["seed"],), packaged=True)
     path = directory / "config.json"
     if not path.is_file():
@@ -71,30 +82,38 @@ def read_run(directory: str | Path) -> Run:
                 f"{directory} is a sweep: name the policies of one of its configurations, such as "
                 f"{directory / 'policies' / '000'}"
             )
-        raise ValueError(
-            f"{directory} is not a run directory: there is no {path}"
-            f"{'' if directory.is_dir() else _packaged(directory.name)}"
-        )
-    found: dict[str, Any] = {"seeds": None, "env_set": []} | read_json(path)
+        # Who names a directory that does not exist may have meant a task.
+        hint = ""
+        if not directory.is_dir():
+            hint = _packaged(directory.name)
+        raise ValueError(f"{directory} is not a run directory: there is no {path}{hint}")
+    config: dict[str, Any] = {"seeds": None, "env_set": []} | read_json(path)
     with naming_damage(path):
-        if isinstance(found["seeds"], str):  # a share of a run; where a sweep kept a few, a list
-            found["seeds"] = [*read_seeds(found["seeds"])]
+        # In words, "0-99", of a share of a run; a list where a sweep kept a few.
+        if isinstance(config["seeds"], str):
+            config["seeds"] = [*read_seeds(config["seeds"])]
         for name, kind in _KINDS.items():
-            check_type(name, found.get(name), kind)
-        if not 1 <= found["horizon"] < 2**31:
-            raise ValueError(f"horizon must be from 1 to 2^31 - 1, got {found['horizon']}")
+            check_type(name, config.get(name), kind)
+        if not 1 <= config["horizon"] < 2**31:
+            raise ValueError(f"horizon must be from 1 to 2^31 - 1, got {config['horizon']}")
+    # Policies are written when training ends.
     if not (directory / "policy").is_dir():
         raise ValueError(f"{directory} has no policy yet: {_NOT_YET}")
-    seeds = None if found["seeds"] is None else tuple(found["seeds"])
-    return Run(directory, found["env"], found["horizon"], seeds, tuple(found["env_set"]))
+    # None is not (): without a list, the policies are those of the seeds 0, 1, ...
+    seeds = config["seeds"]
+    if seeds is not None:
+        seeds = tuple(seeds)
+    return Run(directory, config["env"], config["horizon"], seeds, tuple(config["env_set"]))
 
 
 def _packaged(name: str) -> str:
     """Returns which tasks the package has policies for, the one that was meant first."""
-    known = sorted(pretrained())
-    near = nearest(name, known)
-    hint = f". Did you mean {near!r}?" if near else "."
-    return f"{hint} Policies of the package: {', '.join(known)}"
+    tasks = sorted(pretrained())
+    hint = "."
+    closest_task = nearest(name, tasks)
+    if closest_task:
+        hint = f". Did you mean {closest_task!r}?"
+    return f"{hint} Policies of the package: {', '.join(tasks)}"
 
 
 def seeds_in(directory: Path) -> tuple[int, ...]:
@@ -104,21 +123,24 @@ def seeds_in(directory: Path) -> tuple[int, ...]:
     return read_run(directory).seeds or ()
 
 
-def policy_folder(run: Run, which: Which) -> Path:
+def policy_folder(run: Run, choice: PolicyChoice) -> Path:
     """Returns the folder of a run's policies.
 
     Raises:
-      ValueError: ``which`` is unknown, or the run kept no such policies.
+      ValueError: the choice is unknown, or the run kept no such policies.
     """
-    if which not in _PLACES:
-        raise ValueError(f"which must be one of {', '.join(_PLACES)}, got {which!r}")
-    folder = run.directory if run.packaged else run.directory / _PLACES[which][0]
+    if choice not in _PLACES:
+        raise ValueError(f"which must be one of {', '.join(_PLACES)}, got {choice!r}")
+    # The package has one policy of a task, without a folder around it.
+    folder = run.directory if run.packaged else run.directory / _PLACES[choice].folder
     if not folder.is_dir():
-        raise ValueError(f"{run.directory} has no {_PLACES[which][0]}: it kept the last policies")
+        raise ValueError(
+            f"{run.directory} has no {_PLACES[choice].folder}: it kept the last policies"
+        )
     return folder
 
 
-def choose_seed(run: Run, seed: SeedChoice, which: Which = "last") -> int:
+def choose_seed(run: Run, seed: SeedChoice, choice: PolicyChoice = "last") -> int:
     """Returns the number of a seed.
 
     Args:
@@ -126,15 +148,15 @@ def choose_seed(run: Run, seed: SeedChoice, which: Which = "last") -> int:
       seed: a number, which is returned as it is; or "best", "worst" or "median" (the lower one
         of two) by return in the run's final evaluation, where a return that is not finite is
         below all others.
-      which: whose returns.
+      choice: of which policies the returns are.
 
     Raises:
       ValueError: the run has no such policies or no final evaluation, or ``seed`` is none of
         these.
     """
-    policy_folder(run, which)
+    policy_folder(run, choice)
     if run.packaged and run.seeds is not None:
-        if (seed, which) == ("best", "last"):
+        if (seed, choice) == ("best", "last"):
             return run.seeds[0]
         raise ValueError(
             f"the package has one policy for {run.env}, of the best seed; leave other choices out, "
@@ -144,21 +166,24 @@ def choose_seed(run: Run, seed: SeedChoice, which: Which = "last") -> int:
         return int(seed)
     if seed not in ("best", "worst", "median"):
         raise ValueError(f"seed must be best, worst, median or a number, got {seed!r}")
-    returns = final_returns(run, which)
+    returns = final_returns(run, choice)
     order = np.argsort(returns, kind="stable")
+    # Not order[-1]: of equal returns, the best is that of the lowest seed.
     ranked = {"worst": order[0], "median": order[(len(order) - 1) // 2], "best": returns.argmax()}
     place = int(ranked[seed])
     return place if run.seeds is None else run.seeds[place]
 
 
-def final_returns(run: Run, which: Which) -> np.ndarray:
+def final_returns(run: Run, choice: PolicyChoice) -> np.ndarray:
     """Returns each seed's return [S] in the final evaluation, -inf where it was not finite.
 
     Raises:
       ValueError: the run has no final evaluation, or none of its returns is finite.
     """
-    path, name = run.directory / "summary.json", _PLACES[which][1]
+    path = run.directory / "summary.json"
+    name = _PLACES[choice].returns
     remedy = "choose a seed by its number"
+    # A run that was killed early has no summary; later, one that still says "running".
     summary: dict[str, Any] = read_json(path) if path.exists() else {"status": "running"}
     if summary.get("status") == "running":
         raise ValueError(f"{run.directory} has no final evaluation: {_NOT_YET}; {remedy}")

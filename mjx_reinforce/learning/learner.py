@@ -405,7 +405,8 @@ def train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics
 
     Returns:
       The next state, and metrics, each []: ``episodes`` (N), ``episode_return`` (mean over the N
-      episodes; with ``_min`` and ``_max``), ``episode_length``, ``env_steps`` (played in this
+      episodes; with ``episode_return_min`` and ``episode_return_max``), ``episode_length``,
+      ``env_steps`` (played in this
       update), ``simulated_steps`` (also those after an episode's end; with the native engine they
       depend on which thread is first), ``nonfinite_episodes`` (those that broke; they count above
       with what they earned until then), and ``skipped_update`` (1 if the proposed state was not

@@ -25,13 +25,18 @@ _TEMPLATES = resources.files("mjx_reinforce.reports") / "files"
 
 def draw_charts(findings: Findings) -> list[charts.Chart]:
     """Returns the charts that show something, numbered; those of all settings as one."""
-    made: list[charts.Chart] = []
-    for chart in _CHARTS:
-        place = made[-1].number + 1 if made else 1
-        for each in chart.draw(findings):
-            if any(table["configuration"] for table in each.data.values()):
-                made.append(each._replace(number=place))
-    return made
+    numbered: list[charts.Chart] = []
+    number = 1
+    for module in _CHARTS:
+        shown = [
+            chart
+            for chart in module.draw(findings)
+            if any(table["configuration"] for table in chart.data.values())
+        ]
+        numbered += [chart._replace(number=number) for chart in shown]
+        # A kind without charts leaves no gap in the numbers; one with several is one figure.
+        number += bool(shown)
+    return numbered
 
 
 def render(
@@ -58,12 +63,13 @@ def render(
     content = {
         "labels": findings.labels,
         "specs": {figure.name: figure.spec for figure in drawn},
-        "tables": {name: x for each in drawn for name, x in each.data.items()},
+        "tables": {name: table for figure in drawn for name, table in figure.data.items()},
         "moments": stops,
         "results": results,
         "row": distribution.ROW,
         "light": charts.LIGHT,
     }
+    # Labels and paths are other people's text: all is escaped but what ``Markup`` exempts.
     loader = jinja2.Environment(
         loader=jinja2.FunctionLoader(_read_template),
         autoescape=True,
@@ -109,15 +115,16 @@ def _text(findings: Findings, drawn: list[charts.Chart]) -> dict[str, Any]:
     figures = {figure.name: figure for figure in drawn}
     sensitivity = [figure for figure in drawn if figure.name.startswith("sensitivity-")]
     listed = listings(findings)
+    # A chart that shows nothing is None, so that the template can ask for it.
     names = ("final", "curves", "solved", "distribution")
-    failures = any(not math.isfinite(x) for each in findings.results for x in each.final)
+    failures = any(not math.isfinite(x) for result in findings.results for x in result.final)
     return {
         "answer": words.headline(findings),
         "distrust": list(words.caveats(findings)),
         "figures": {name: figures.get(name) for name in names},
         "failures": failures,
         "several": len(findings.results) > 1,
-        "few": not all(enough(len(each.final)) for each in findings.results),
+        "few": not all(enough(len(result.final)) for result in findings.results),
         "solved": findings.experiment.threshold is not None and words.solved(findings.experiment),
         "two_ways": words.two_ways(findings),
         "pairs": counted(len(findings.comparisons), "pair"),
@@ -135,6 +142,7 @@ _NAMES = {"git_commit": "last commit of the package's files"}
 
 def provenance_rows(experiment: Experiment) -> dict[str, Any]:
     """Returns where the numbers come from, as pairs of names and values."""
+    # Each directory once, in the order in which they were named: a sweep has many configurations.
     directories = list(dict.fromkeys(map(str, experiment.directories)))
     facts = [("read from", ", ".join(directories))]
     facts += [
@@ -153,10 +161,12 @@ def provenance_rows(experiment: Experiment) -> dict[str, Any]:
 def _in_words(value: object) -> str:
     """Returns an entry of the provenance in words."""
     if isinstance(value, Mapping):
-        listed = (
-            (setting_in_words(key), _in_words(x)) for key, x in value.items() if x is not None
+        # None is what was not known, such as the commit of a folder without git.
+        return "; ".join(
+            f"{setting_in_words(key)} {_in_words(entry)}"
+            for key, entry in value.items()
+            if entry is not None
         )
-        return "; ".join(f"{key} {said}" for key, said in listed)
     if isinstance(value, list):
         return ", ".join(map(_in_words, value))
     return say(value)

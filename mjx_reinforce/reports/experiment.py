@@ -80,8 +80,9 @@ def setting_in_words(name: str) -> str:
 def say(value: object) -> str:
     """Returns the value of a setting in words; sizes of layers as 32-32."""
     if isinstance(value, list | tuple):
-        between = " " if any(isinstance(x, str) for x in value) else "-"
-        return between.join(map(say, value)) or "none"
+        # Words may have hyphens of their own.
+        separator = " " if any(isinstance(x, str) for x in value) else "-"
+        return separator.join(map(say, value)) or "none"
     if isinstance(value, float):
         return f"{value:.4g}"
     return "none" if value is None else str(value)
@@ -89,7 +90,7 @@ def say(value: object) -> str:
 
 def counted(number: int, noun: str) -> str:
     """Returns a number and its noun: "1 seed", "1,024 seeds"."""
-    return f"{number:,} {noun}" + ("" if number == 1 else "s")
+    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
 
 
 def lengthened(curves: np.ndarray, length: int) -> np.ndarray:
@@ -99,6 +100,8 @@ def lengthened(curves: np.ndarray, length: int) -> np.ndarray:
 
 def ordered(values: Sequence[Any]) -> list[Any]:
     """Returns the different values of a setting: numbers by size, others as they come."""
+    # By ``repr``: lists cannot be keys of a dict, and True would be the key 1.
     different = list({repr(value): value for value in values}.values())
-    numbers = all(isinstance(x, int | float) for x in different)
-    return sorted(different) if numbers else different
+    if all(isinstance(value, int | float) for value in different):
+        return sorted(different)
+    return different

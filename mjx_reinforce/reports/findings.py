@@ -27,7 +27,8 @@ _GRID_POINTS = 60
 #: Ends that are so close are those of one budget.
 _SAME_BUDGET = 0.9
 #: How many of the worst seeds are named, and what share of all, at most.
-_WORST, _WORST_SHARE = 10, 0.25
+_WORST = 10
+_WORST_SHARE = 0.25
 
 
 class Solving(NamedTuple):
@@ -99,12 +100,12 @@ class Findings(NamedTuple):
     @property
     def intervals(self) -> bool:
         """Whether the mean of any configuration has an interval."""
-        return any(math.isfinite(each.mean.low) for each in self.results)
+        return any(math.isfinite(result.mean.low) for result in self.results)
 
     @property
     def labels(self) -> list[str]:
         """The names of the configurations, the best first."""
-        return [each.configuration.label for each in self.results]
+        return [result.configuration.label for result in self.results]
 
 
 def compute_findings(experiment: Experiment) -> Findings:
@@ -114,11 +115,13 @@ def compute_findings(experiment: Experiment) -> Findings:
     # A seed stops after the update that reaches its budget, so that ends differ a little.
     grid = _curve_steps(parts, min(end for end in ends if end >= _SAME_BUDGET * max(ends)))
     finals = np.concatenate([part.eval_return[-1] for part in parts])
+    # Of all configurations: a seed that failed is then as bad in one as in another.
     worst = min(finals[np.isfinite(finals)], default=math.nan)
     results = [
         _result(part, grid, worst, _solving_of(part, experiment, min(ends)), min(ends))
         for part in parts
     ]
+    # From here on a configuration is known by its rank; ``order`` leads back to the sources.
     order = sorted(range(len(results)), key=lambda i: _rank(results[i]))
     ranked = [results[i] for i in order]
     return Findings(
@@ -146,6 +149,7 @@ def on_grid(grid: np.ndarray, steps: np.ndarray, returns: np.ndarray) -> np.ndar
 
 def _curve_steps(parts: Sequence[Configuration], end: int) -> np.ndarray:
     """Returns env steps from 0 to the end: evenly, and with more at the start for a log axis."""
+    # The first evaluation is that before training, at 0, and the second is the first to learn from.
     first = min(int(part.env_steps[min(1, len(part.env_steps) - 1)].max()) for part in parts)
     even = np.linspace(0, end, _GRID_POINTS - 12)
     early = np.geomspace(max(first, 1), max(end, 2), 14)[:-1]
@@ -155,13 +159,23 @@ def _curve_steps(parts: Sequence[Configuration], end: int) -> np.ndarray:
 def _result(
     part: Configuration, grid: np.ndarray, worst: float, solving: Solving | None, until: int
 ) -> Result:
-    final, end = part.eval_return[-1], part.env_steps[-1].min()
+    """Returns the figures of a configuration.
+
+    Args:
+      part: the configuration.
+      grid: [K] env steps at which curves are read off.
+      worst: the return of a seed that failed.
+      solving: its figures of the threshold, if there is one.
+      until: env steps at which areas end.
+    """
+    final = part.eval_return[-1]
     seeds = on_grid(grid, part.env_steps, part.eval_return)
+    # Interpolation would hold the last value where a curve has ended.
+    end = part.env_steps[-1].min()
     seeds = np.where((grid <= end)[:, None], seeds, np.nan)
     scores = np.where(np.isfinite(final), final, worst)
-    areas = mean_while_training(
-        np.where(np.isfinite(part.eval_return), part.eval_return, worst), part.env_steps, until
-    )
+    finite_returns = np.where(np.isfinite(part.eval_return), part.eval_return, worst)
+    areas = mean_while_training(finite_returns, part.env_steps, until)
     return Result(
         configuration=part,
         final=final,
@@ -177,9 +191,11 @@ def _result(
 
 
 def _solving_of(part: Configuration, experiment: Experiment, until: int) -> Solving | None:
-    if experiment.threshold is None:
+    """Returns the figures of the threshold, of env steps up to ``until``; None without one."""
+    threshold = experiment.threshold
+    if threshold is None:
         return None
-    returns, threshold = part.eval_return, experiment.threshold
+    returns = part.eval_return
     steps, solved = time_to_threshold(returns, part.env_steps, threshold)
     at_end = int(np.sum(returns[-1] >= threshold))
     return Solving(
@@ -194,24 +210,29 @@ def _solving_of(part: Configuration, experiment: Experiment, until: int) -> Solv
     )
 
 
-def _rank(result: Result) -> tuple[float, float]:
+def _rank(result: Result) -> tuple[float, ...]:
     """Returns the sorting key of a result: its mean, and where that is the same, its speed."""
     speed = float(result.solving.mean.value) if result.solving else 0.0
     mean = float(result.mean.value)
-    return math.inf if math.isnan(mean) else -mean, math.inf if math.isnan(speed) else speed
+    # NaN compares as neither less nor more, and would leave the others in any order: it is last.
+    return tuple(math.inf if math.isnan(value) else value for value in (-mean, speed))
 
 
 def _compare_pairs(results: Sequence[Result]) -> list[Comparison]:
     """Compares the scores of all pairs, on the seeds that all of them have."""
-    shared = functools.reduce(np.intersect1d, [each.configuration.seed for each in results])
+    seeds = [result.configuration.seed for result in results]
+    shared = functools.reduce(np.intersect1d, seeds)
     if len(results) < 2 or len(shared) < 2:
         return []
-    return compare_all([each.scores[np.isin(each.configuration.seed, shared)] for each in results])
+    # Seeds ascend in every source, so that the shared ones stand in one order.
+    return compare_all(
+        [result.scores[np.isin(result.configuration.seed, shared)] for result in results]
+    )
 
 
 def by_speed(results: Sequence[Result]) -> list[int]:
     """Returns the places of results by their mean env steps to solve, the fewest first."""
-    means = [float(each.solving.mean.value) for each in results if each.solving is not None]
+    means = [float(result.solving.mean.value) for result in results if result.solving is not None]
     return np.argsort(means, kind="stable").tolist()
 
 
@@ -220,23 +241,27 @@ def compare_speeds(results: Sequence[Result]) -> dict[tuple[int, int], float]:
 
     There are none where no seed solves the task.
     """
-    solving = [each.solving for each in results if each.solving is not None]
-    if not any(each.ever for each in solving):
+    solving = [result.solving for result in results if result.solving is not None]
+    if not any(figures.ever for figures in solving):
         return {}
     pairs = list(itertools.combinations(range(len(solving)), 2))
-    times = [(each.steps, each.solved) for each in solving]
-    found = [log_rank(*times[i], *times[j]).p_value for i, j in pairs]
-    return dict(zip(pairs, holm(found).tolist(), strict=True))
+    p_values = [
+        log_rank(solving[i].steps, solving[i].solved, solving[j].steps, solving[j].solved).p_value
+        for i, j in pairs
+    ]
+    return dict(zip(pairs, holm(p_values).tolist(), strict=True))
 
 
 def swept(findings: Findings) -> list[str]:
     """Returns the settings of which configurations differ."""
-    return list(findings.results[0].configuration.settings) if len(findings.results) > 1 else []
+    if len(findings.results) == 1:
+        return []
+    return list(findings.results[0].configuration.settings)
 
 
 def values_of(findings: Findings, name: str) -> list[Any]:
     """Returns the value of a setting in each result."""
-    return [each.configuration.settings.get(name) for each in findings.results]
+    return [result.configuration.settings.get(name) for result in findings.results]
 
 
 def worst_seeds(result: Result) -> np.ndarray:

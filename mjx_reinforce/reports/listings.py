@@ -17,13 +17,14 @@ Listing = dict[str, Any]
 
 def listings(findings: Findings) -> dict[str, Listing]:
     """Returns the tables of a report by name, in the order of the page."""
-    found = {
+    tables = {
         "results": _results_table(findings),
         "speed": _speed_table(findings),
         "against": _against(findings),
         "worst": _worst(findings),
     }
-    return {name: listing for name, listing in found.items() if listing}
+    # The page numbers those that are there.
+    return {name: listing for name, listing in tables.items() if listing}
 
 
 def _row(result: Result, cells: Sequence[tuple[str, str]]) -> dict[str, Any]:
@@ -41,34 +42,42 @@ def _results_table(findings: Findings) -> Listing:
     if findings.experiment.threshold is not None:
         header += ["solved at the end", "steps until half solved", "fell back"]
     rows = []
-    for each in findings.results:
-        seeds = len(each.final)
-        cells = [(f"{seeds:,}", ""), _cell(each.mean), _cell(each.iqm), (number(each.tail), "")]
-        if (solving := each.solving) is not None:
-            share = f"{solving.at_end:,} of {seeds:,}"
+    for result in findings.results:
+        num_seeds = len(result.final)
+        cells = [(f"{num_seeds:,}", ""), _cell(result.mean), _cell(result.iqm)]
+        cells.append((number(result.tail), ""))
+        solving = result.solving
+        if solving is not None:
+            # In counts: a reader asks of how many seeds a share is.
+            share = f"{solving.at_end:,} of {num_seeds:,}"
             cells.append((share, interval_in_words(solving.rate, percent)))
             cells.append(_cell(solving.median, steps))
             cells.append((f"{int(solving.fell.sum()):,}", ""))
-        cells.append((f"{int(np.sum(~np.isfinite(each.final))):,}", ""))
-        rows.append(_row(each, cells))
+        cells.append((f"{int(np.sum(~np.isfinite(result.final))):,}", ""))
+        rows.append(_row(result, cells))
     return {"header": [*header, "not finite"], "rows": rows}
 
 
 def _speed_table(findings: Findings) -> Listing:
     """Returns the table of who learns faster: the fastest first, or who earned most on the way."""
-    compared, header = findings.results[:COMPARED], ["", "configuration", "return while training"]
-    order = np.argsort([-each.area.value for each in compared], kind="stable").tolist()
+    compared = findings.results[:COMPARED]
+    header = ["", "configuration", "return while training"]
+    order = np.argsort([-result.area.value for result in compared], kind="stable").tolist()
     if findings.speeds:
         header += ["mean steps to solve", "log-rank p, Holm"]
         order = by_speed(compared)
+    fastest = order[0]
     rows = []
     for i in order:
-        each, pair = compared[i], (min(i, order[0]), max(i, order[0]))
-        cells = [_cell(each.area)]
-        if findings.speeds and each.solving:
-            p_value = short_p(findings.speeds[pair]) if i != order[0] else "fastest"
-            cells += [_cell(each.solving.mean, steps), (p_value, "")]
-        rows.append(_row(each, cells))
+        result = compared[i]
+        cells = [_cell(result.area)]
+        if findings.speeds and result.solving:
+            # Tests are kept once a pair, the lower place first.
+            p_value = "fastest"
+            if i != fastest:
+                p_value = short_p(findings.speeds[min(i, fastest), max(i, fastest)])
+            cells += [_cell(result.solving.mean, steps), (p_value, "")]
+        rows.append(_row(result, cells))
     return {"header": header, "rows": rows}
 
 
@@ -79,24 +88,30 @@ def _against(findings: Findings) -> Listing:
         cells = [_cell(pair.difference), _cell(pair.improvement, percent)]
         cells += [(short_p(pair.p_value), ""), (short_p(pair.adjusted), "")]
         rows.append(_row(findings.results[pair.second], cells))
+    if not rows:
+        return {}
     header = ["against", "difference", "best is better", "p", "p, Holm"]
-    return {"header": header, "rows": rows} if rows else {}
+    return {"header": header, "rows": rows}
 
 
 def _worst(findings: Findings) -> Listing:
     """Returns the best configuration's worst seeds and the others' worst one."""
-    best, *others = findings.results
+    best, *challengers = findings.results
     seeds = [(best, s) for s in worst_seeds(best)]
-    seeds += [(each, worst_seeds(each)[0]) for each in others[: COMPARED - 1]]
+    seeds += [(result, worst_seeds(result)[0]) for result in challengers[: COMPARED - 1]]
     header = ["configuration", "seed", "final return", "best return"]
     if findings.experiment.threshold is not None:
         header.append("first solved at")
     rows = []
-    for each, s in seeds:
-        part, solving = each.configuration, each.solving
+    for result, s in seeds:
+        part = result.configuration
+        # fmax leaves NaN out: a seed that broke may have been good before.
         best_return = float(np.fmax.reduce(part.eval_return[:, s]))
-        cells = [str(int(part.seed[s])), number(float(each.final[s])), number(best_return)]
-        if solving:
-            cells.append(steps(float(solving.steps[s])) if solving.solved[s] else "never")
-        rows.append(_row(each, [(cell, "") for cell in cells]))
+        cells = [str(int(part.seed[s])), number(float(result.final[s])), number(best_return)]
+        if result.solving:
+            solved_at = "never"
+            if result.solving.solved[s]:
+                solved_at = steps(float(result.solving.steps[s]))
+            cells.append(solved_at)
+        rows.append(_row(result, [(cell, "") for cell in cells]))
     return {"header": header, "rows": rows}

@@ -25,15 +25,23 @@ from mjx_reinforce.reports.experiment import (
 
 #: What config.json says besides the settings.
 PROVENANCE = (
-    *("python", "packages", "git_commit", "device", "cpu", "machine_code", "jax_settings"),
-    *("num_devices", "cpu_count", "cores", "x64", "xla_flags", "resumed"),
-)
-#: What sweep.json says of the sweep itself; all else is its provenance.
-_OWN = (
-    *("status", "env", "threshold", "settings", "configurations"),
-    *("compile_seconds", "run_seconds", "statistics_seconds"),
+    "python",
+    "packages",
+    "git_commit",
+    "device",
+    "cpu",
+    "machine_code",
+    "jax_settings",
+    "num_devices",
+    "cpu_count",
+    "cores",
+    "x64",
+    "xla_flags",
+    "resumed",
 )
 _TIMINGS = ("compile_seconds", "run_seconds", "statistics_seconds")
+#: What sweep.json says of the sweep itself; all else is its provenance.
+_SWEEP_KEYS = ("status", "env", "threshold", "settings", "configurations", *_TIMINGS)
 #: The columns and arrays that are read, and their types.
 _METRICS = {"seed": np.int64, "env_steps": np.int64, "eval_return": np.float64}
 _CURVES = {
@@ -51,7 +59,7 @@ _HOUSEKEEPING = ("output", "resume", "like", "checkpoint_every", "log", "num_see
 _COMPARABLE = ("python", "packages", "git_commit", "device", "x64", "engine")
 
 
-def read_experiment(sources: Sequence[Path]) -> Experiment:
+def read_experiment(paths: Sequence[Path]) -> Experiment:
     """Reads run directories and sweep directories as one experiment.
 
     The configurations of a sweep are told apart by what it swept; those of several sources by the
@@ -63,45 +71,53 @@ def read_experiment(sources: Sequence[Path]) -> Experiment:
         (which file, what is wrong in it), they are of different tasks, or shares do not fit each
         other.
     """
-    if not sources:
+    if not paths:
         raise ValueError("there is nothing to report on: name a run or a sweep directory")
-    known: dict[Path, Path] = {}
-    for source in map(Path, sources):
-        if (first := known.setdefault(source.resolve(), source)) is not source:
-            raise ValueError(f"{first} and {source} are one directory: name each source once")
-    found = [read_directory(source) for source in known.values()]
-    envs = list(dict.fromkeys(source.env for source in found))
+    # Counted twice, the seeds of one directory would look like twice as many.
+    by_place: dict[Path, Path] = {}
+    for path in map(Path, paths):
+        earlier = by_place.setdefault(path.resolve(), path)
+        if earlier is not path:
+            raise ValueError(f"{earlier} and {path} are one directory: name each source once")
+    sources = [read_directory(path) for path in by_place.values()]
+    envs = list(dict.fromkeys(source.env for source in sources))
     if len(envs) > 1:
         raise ValueError(
             f"these are of different tasks ({', '.join(envs)}), whose returns cannot be compared; "
             "make one page per task, or compare tasks by experiments/examples/all_tasks.py"
         )
-    joined = _join_shares(found)
+    joined = _join_shares(sources)
     configurations = _told_apart(joined)
-    for other in configurations[1:]:
-        if not np.intersect1d(configurations[0].seed, other.seed).size:
-            names = ", ".join(map(setting_in_words, other.settings))
-            raise ValueError(
-                f"{configurations[0].label} and {other.label} have no seed in common, so they "
-                "cannot be compared: train both with the same --seeds. As shares of one run they "
-                f"would have to agree in {names}"
-            )
-    thresholds = [source.threshold for source in found if source.threshold is not None]
-    provenance, disagree = _merge_provenance(found)
-    timings = sum((Counter(source.timings) for source in found), Counter())
-    env = found[0].env
+    _check_common_seeds(configurations)
+    # A run whose training goes on has not written its threshold yet.
+    thresholds = (source.threshold for source in sources if source.threshold is not None)
+    provenance, disagree = _merge_provenance(sources)
+    timings = sum((Counter(source.timings) for source in sources), Counter())
     return Experiment(
-        title=f"{env}, {counted(len(configurations), 'configuration')}",
-        env=env,
-        threshold=thresholds[0] if thresholds else None,
+        title=f"{envs[0]}, {counted(len(configurations), 'configuration')}",
+        env=envs[0],
+        threshold=next(thresholds, None),
         configurations=configurations,
-        settings=_in_common(found),
+        settings=_in_common(sources),
         provenance=provenance,
         timings=dict(timings),
         directories=[source.directory for source in joined for _ in source.configurations],
-        unfinished=[source.directory for source in found if source.status != "finished"],
+        unfinished=[source.directory for source in sources if source.status != "finished"],
         disagree=disagree,
     )
+
+
+def _check_common_seeds(configurations: Sequence[Configuration]) -> None:
+    """Raises ValueError for a configuration that shares no seed with the first."""
+    reference, *challengers = configurations
+    for part in challengers:
+        if not np.intersect1d(reference.seed, part.seed).size:
+            names = ", ".join(map(setting_in_words, part.settings))
+            raise ValueError(
+                f"{reference.label} and {part.label} have no seed in common, so they "
+                "cannot be compared: train both with the same --seeds. As shares of one run they "
+                f"would have to agree in {names}"
+            )
 
 
 def _join_shares(sources: Sequence[Source]) -> list[Source]:
@@ -110,24 +126,28 @@ def _join_shares(sources: Sequence[Source]) -> list[Source]:
     Raises:
       ValueError: shares have a seed in common.
     """
-    alike: dict[str, list[Source]] = {}
+    groups: dict[str, list[Source]] = {}
     for source in sources:
         settings = {k: x for k, x in source.settings.items() if k not in _HOUSEKEEPING}
-        trained = settings, [part.settings for part in source.configurations]
-        alike.setdefault(repr(trained), []).append(source)
+        training = settings, [part.settings for part in source.configurations]
+        groups.setdefault(repr(training), []).append(source)
     joined = []
-    for shares in alike.values():
+    for shares in groups.values():
+        # Equal settings without --seeds are a run repeated, which is a configuration of its own.
         if any(share.settings.get("seeds") for share in shares):
-            parts = zip(*(share.configurations for share in shares), strict=True)
-            shares = [shares[0]._replace(configurations=[_join_parts(each) for each in parts])]
+            configurations = zip(*(share.configurations for share in shares), strict=True)
+            whole = [_join_parts(parts) for parts in configurations]
+            shares = [shares[0]._replace(configurations=whole)]
         joined += shares
     return joined
 
 
 def _join_parts(parts: Sequence[Configuration]) -> Configuration:
     """Returns one configuration of several shares; seeds that ended earlier repeat their last."""
+    # A share ends with the slowest of its own seeds, so that shares differ in evaluations.
     length = max(len(part.eval_return) for part in parts)
     where = [place for part in parts for place in part.where]
+    # ``order`` sorts the runs of all shares by their seeds.
     seed, order, times = np.unique(
         np.concatenate([part.seed for part in parts]), return_index=True, return_counts=True
     )
@@ -137,13 +157,13 @@ def _join_parts(parts: Sequence[Configuration]) -> Configuration:
             "common, with equal settings: give each share its own --seeds, or leave one out"
         )
 
-    def together(name: str) -> np.ndarray:
-        each = [lengthened(getattr(part, name), length) for part in parts]
-        return np.concatenate(each, axis=1)[:, order]
+    def joined(name: str) -> np.ndarray:
+        curves = [lengthened(getattr(part, name), length) for part in parts]
+        return np.concatenate(curves, axis=1)[:, order]
 
     return parts[0]._replace(
-        eval_return=together("eval_return"),
-        env_steps=together("env_steps"),
+        eval_return=joined("eval_return"),
+        env_steps=joined("env_steps"),
         nonfinite=np.concatenate([part.nonfinite for part in parts])[order],
         seed=seed,
         where=[where[i] for i in order],
@@ -158,35 +178,41 @@ def _told_apart(sources: Sequence[Source]) -> list[Configuration]:
     differ = [
         name
         for name in names
-        if name not in _HOUSEKEEPING and len({repr(each.get(name)) for each in full}) > 1
+        if name not in _HOUSEKEEPING and len({repr(settings.get(name)) for settings in full}) > 1
     ]
     parts = []
     for (source, part), settings in zip(pairs, full, strict=True):
-        own = {name: settings.get(name) for name in differ}
-        # A run by itself is its task; several of one task are told by their directories.
-        place = _path_in_words(source.directory.name)
-        label = settings_in_words(own) or (source.env if len(pairs) == 1 else place)
-        parts.append(part._replace(settings=own, label=label))
+        differences = {name: settings.get(name) for name in differ}
+        label = settings_in_words(differences)
+        if not label:
+            # A run by itself is its task; several of one task are told by their directories.
+            label = source.env if len(pairs) == 1 else _path_in_words(source.directory.name)
+        parts.append(part._replace(settings=differences, label=label))
+    # Charts and tables know a configuration by its label alone: no two may be equal.
     times = Counter(part.label for part in parts)
-    places = [f" in {_path_in_words(source.directory)}" for source, _ in pairs]
-    return [
-        part._replace(label=part.label + where * (times[part.label] > 1))
-        for part, where in zip(parts, places, strict=True)
-    ]
+    for i, (source, _) in enumerate(pairs):
+        label = parts[i].label
+        if times[label] > 1:
+            label = f"{label} in {_path_in_words(source.directory)}"
+            parts[i] = parts[i]._replace(label=label)
+    return parts
 
 
 def _in_common(sources: Sequence[Source]) -> dict[str, Any]:
     """Returns the settings that all configurations of all sources share."""
-    first, *others = (source.settings for source in sources)
     swept = {name for source in sources for part in source.configurations for name in part.settings}
     shared = {
         name: value
-        for name, value in first.items()
+        for name, value in sources[0].settings.items()
         if name not in (*_HOUSEKEEPING, *swept)
-        and all(name in x and x[name] == value for x in others)
+        and all(name in x.settings and x.settings[name] == value for x in sources[1:])
     }
-    if words := shared.get("env_set"):  # of the environment's own settings, some may be swept
-        shared["env_set"] = [x for x in words if f"env_set.{x.partition('=')[0]}" not in swept]
+    # NAME=VALUE each; a sweep over one of them is over "env_set.NAME".
+    assignments = shared.get("env_set")
+    if assignments:
+        shared["env_set"] = [
+            text for text in assignments if f"env_set.{text.partition('=')[0]}" not in swept
+        ]
     return shared
 
 
@@ -196,12 +222,16 @@ def _merge_provenance(sources: Sequence[Source]) -> tuple[dict[str, Any], list[s
     An entry in which they differ holds the answer of each directory.
     """
     names = dict.fromkeys(name for source in sources for name in source.provenance)
-    merged, disagree = {}, []
+    merged = {}
+    disagree = []
     for name in names:
         answers = {str(s.directory): s.provenance.get(name) for s in sources}
-        same = len({repr(answer) for answer in answers.values()}) == 1
-        merged[name] = next(iter(answers.values())) if same else answers
-        if not same and name in _COMPARABLE:
+        if len({repr(answer) for answer in answers.values()}) == 1:
+            merged[name] = sources[0].provenance.get(name)
+            continue
+        merged[name] = answers
+        # Two commands are no reason for distrust, but two devices are.
+        if name in _COMPARABLE:
             disagree.append(name)
     return merged, disagree
 
@@ -232,39 +262,48 @@ def read_directory(directory: Path) -> Source:
 
 def _read_run(directory: Path, config: dict[str, Any]) -> Source:
     """Reads a run with this config.json."""
-    path, columns = directory / "summary.json", read_metrics(directory / "metrics.csv")
-    summary: dict[str, Any] = read_json(path) if path.exists() else {"status": "running"}
+    columns = read_metrics(directory / "metrics.csv")
     num_seeds = len(columns["seed"])
+    # The summary is written at the end; until then the run is read as far as it came.
+    path = directory / "summary.json"
+    summary: dict[str, Any] = {"status": "running"}
+    if path.exists():
+        summary = read_json(path)
     with naming_damage(path):
-        # A run that goes on has no counts yet.
+        # [S] counts; a run that goes on has none yet, and 0 stands for all seeds.
         counts = np.array(summary.get("nonfinite", 0), np.int64)
         nonfinite = np.broadcast_to(counts, num_seeds)
         outcome = _outcome(summary)
-    where = [directory] * num_seeds
-    kept = {name: value for name, value in config.items() if name in PROVENANCE}
+    part = Configuration(
+        directory.name, {}, nonfinite=nonfinite, where=[directory] * num_seeds, **columns
+    )
+    provenance = {name: value for name, value in config.items() if name in PROVENANCE}
+    # The engine that was chosen, in place of "auto" in the settings.
+    provenance["engine"] = summary.get("engine", config.get("engine"))
     return Source(
         directory=directory,
         env=config["env"],
-        configurations=[
-            Configuration(directory.name, {}, nonfinite=nonfinite, where=where, **columns)
-        ],
+        configurations=[part],
         settings={name: value for name, value in config.items() if name not in PROVENANCE},
-        provenance=kept | {"engine": summary.get("engine", config.get("engine"))},
+        provenance=provenance,
         **outcome,
     )
 
 
 def _read_sweep(directory: Path, content: dict[str, Any]) -> Source:
     """Reads a sweep with this sweep.json."""
-    found = _read_curves(directory)
-    if not len(found["seed"]):
+    curves = _read_curves(directory)
+    if not len(curves["seed"]):
         raise ValueError(f"{directory} has no results yet; wait for the first, or --resume it")
     parts = []
     with naming_damage(directory / "sweep.json"):
+        # By this key, a number that is missing is named so in the error.
         swept = {f"configuration {x.pop('configuration')}": x for x in content["configurations"]}
-        for number in np.unique(found["configuration"]):
-            runs, settings = found["configuration"] == number, swept[f"configuration {number}"]
-            columns = {name: found[name][..., runs] for name in _COLUMNS}
+        # A sweep that goes on has results of some configurations alone.
+        for number in np.unique(curves["configuration"]):
+            settings = swept[f"configuration {number}"]
+            runs = curves["configuration"] == number
+            columns = {name: curves[name][..., runs] for name in _COLUMNS}
             where = [directory] * int(runs.sum())
             label = settings_in_words(settings)
             parts.append(Configuration(label, settings, where=where, **columns))
@@ -273,7 +312,7 @@ def _read_sweep(directory: Path, content: dict[str, Any]) -> Source:
             env=content["env"],
             configurations=parts,
             settings=content.get("settings", {}),
-            provenance={name: x for name, x in content.items() if name not in _OWN},
+            provenance={name: x for name, x in content.items() if name not in _SWEEP_KEYS},
             **_outcome(content),
         )
 
@@ -281,9 +320,12 @@ def _read_sweep(directory: Path, content: dict[str, Any]) -> Source:
 def _outcome(content: Mapping[str, Any]) -> dict[str, Any]:
     """Returns what a file says of ``threshold``, ``timings`` and ``status``."""
     names = ("threshold", *_TIMINGS)
-    timings = {name: float(content[name]) for name in names if content.get(name) is not None}
-    threshold, status = timings.pop("threshold", None), content.get("status", "finished")
-    return {"threshold": threshold, "timings": timings, "status": status}
+    numbers = {name: float(content[name]) for name in names if content.get(name) is not None}
+    return {
+        "threshold": numbers.pop("threshold", None),
+        "timings": numbers,
+        "status": content.get("status", "finished"),
+    }
 
 
 def _read_curves(directory: Path) -> dict[str, np.ndarray]:
@@ -291,14 +333,14 @@ def _read_curves(directory: Path) -> dict[str, np.ndarray]:
     path = directory / "curves.npz"
     arrays = read_arrays(path, _CURVES)
     with naming_damage(path):
-        found = {name: arrays[name].astype(kind) for name, kind in _CURVES.items()}
-        shapes = {name: x.shape[-1:] for name, x in found.items()}
-        if len({*shapes.values()}) > 1 or len(found["eval_return"]) != len(found["env_steps"]):
+        curves = {name: arrays[name].astype(kind) for name, kind in _CURVES.items()}
+        shapes = {name: x.shape[-1:] for name, x in curves.items()}
+        if len({*shapes.values()}) > 1 or len(curves["eval_return"]) != len(curves["env_steps"]):
             raise ValueError(f"its arrays are of different runs: {shapes}")
-        if not len(found["env_steps"]):
+        if not len(curves["env_steps"]):
             raise ValueError("it has no evaluations")
-        _check_steps(found["env_steps"])
-        return found
+        _check_steps(curves["env_steps"])
+        return curves
 
 
 def _check_steps(env_steps: np.ndarray) -> None:
@@ -321,14 +363,17 @@ def read_metrics(path: Path) -> dict[str, np.ndarray]:
     if not len(seed):
         raise ValueError(f"{path} has no evaluation yet; wait for the first, or train again")
     num_seeds = len(np.unique(seed))
-    whole = len(seed) // num_seeds * num_seeds
+    # An evaluation is a line a seed, always in the same order.
     if (seed != np.resize(seed[:num_seeds], len(seed))).any():
         raise ValueError(f"{path} is damaged: its lines are not in the order of the seeds")
-    shape = (-1, num_seeds)
-    found = {name: columns[name][:whole].reshape(shape) for name in ("env_steps", "eval_return")}
+    num_evaluations = len(seed) // num_seeds
+    curves = {
+        name: columns[name][: num_evaluations * num_seeds].reshape(num_evaluations, num_seeds)
+        for name in ("env_steps", "eval_return")
+    }
     with naming_damage(path):
-        _check_steps(found["env_steps"])
-    return found | {"seed": seed[:num_seeds]}
+        _check_steps(curves["env_steps"])
+    return curves | {"seed": seed[:num_seeds]}
 
 
 def read_columns(path: Path, kinds: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -347,7 +392,9 @@ def read_columns(path: Path, kinds: Mapping[str, Any]) -> dict[str, np.ndarray]:
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"cannot read {path} ({error})") from error
     with naming_damage(path):  # csv has a class of errors of its own
+        # A line without its end may have half a number.
         header, *rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines())) or [[]]
-        entries = zip(*rows, strict=True) if rows else [()] * len(header)
-        columns = dict(zip(header, entries, strict=True))
+        columns = {name: [] for name in header}
+        if rows:
+            columns = dict(zip(header, zip(*rows, strict=True), strict=True))
         return {name: np.array(columns[name], kind) for name, kind in kinds.items()}

@@ -17,8 +17,9 @@ LEVEL = 0.05
 _COUNTS = (3, 5, 10)
 #: Fewer seeds than these give an interval that promises more than it keeps.
 _FEW_SEEDS = 20
-#: Seeds of a group that so few others may not show at all, and how often that is not rare.
-_GROUP, _RARE = 0.3, 0.05
+#: The share of a group of seeds that a few may not show at all, and how often that is not rare.
+_GROUP = 0.3
+_RARE = 0.05
 
 
 def number(value: float) -> str:
@@ -37,14 +38,17 @@ def interval_in_words(estimate: Estimate, form: Callable[[float], str] = number)
 
 def within(estimate: Estimate, form: Callable[[float], str] = number) -> str:
     """Returns an interval with its level, "95% interval 997.0 to 999.0", or that there is none."""
-    said = interval_in_words(estimate, form)
-    return said if said == "no interval" else f"95% interval {said}"
+    interval = interval_in_words(estimate, form)
+    if interval == "no interval":
+        return interval
+    return f"95% interval {interval}"
 
 
 def percent(share: float) -> str:
     """Returns a share as a percentage; only all is 100%, and only none 0%."""
     if share in (0.0, 1.0):
         return f"{share:.0%}"
+    # One seed of ten thousand is not none, and all but one are not all.
     return f"{min(max(100 * share, 0.1), 99.9):.1f}%"
 
 
@@ -67,7 +71,7 @@ def short_p(value: float) -> str:
 
 def of_best(findings: Findings) -> list[Comparison]:
     """Returns the comparisons of the best configuration with the others, in their order."""
-    return [each for each in findings.comparisons if each.first == 0]
+    return [pair for pair in findings.comparisons if pair.first == 0]
 
 
 def headline(findings: Findings) -> list[str]:
@@ -79,71 +83,103 @@ def headline(findings: Findings) -> list[str]:
     best = findings.results[0]
     if math.isnan(best.mean.value):
         return ["There is no answer: no seed of any configuration ended with a finite return."]
-    why = ": all seeds are alike" if enough(len(best.final)) else " below six seeds"
-    bounds = within(best.mean).replace("no interval", f"no interval{why}")
+    # A mean without an interval has one of two reasons.
+    reason = " below six seeds"
+    if enough(len(best.final)):
+        reason = ": all seeds are alike"
+    bounds = within(best.mean).replace("no interval", f"no interval{reason}")
     mean = f"a mean return of {number(best.mean.value)} ({bounds})"
     if len(findings.results) == 1:
-        seeds, first = counted(len(best.final), "seed"), best.configuration.eval_return[0]
-        first = first[np.isfinite(first)]
-        before = f", from {number(float(first.mean()))} before training" if first.size else ""
-        said = f"{seeds} of {findings.experiment.env} ended with {mean}{before}."
-        return [said, *_solving(findings)]
-    name, ties = best.configuration.label, _ties(findings)
-    first = f"By the mean, the best is {name}. It ended with {mean}."
+        return [_alone(findings, mean), *_solving(findings)]
+    name = best.configuration.label
+    ties = _ties(findings)
+    answer = f"By the mean, the best is {name}. It ended with {mean}."
+    # Without a test, of configurations that share fewer than two seeds, nobody is surely the best.
     if findings.comparisons and not ties:
-        first = f"The best is {name}. It ended with {mean}."
-    said = [first, *_ahead(findings), *_solving(findings), *_few(findings)]
+        answer = f"The best is {name}. It ended with {mean}."
+    sentences = [answer, *_ahead(findings), *_solving(findings), *_few(findings)]
     speed = _speed(findings)
-    if speed and ties and len(ties) == len(of_best(findings)):
-        return [f"{speed}. The final returns are a tie.", *said]
-    return [*said, f"{speed}."] if speed else said
+    if not speed:
+        return sentences
+    if ties and len(ties) == len(of_best(findings)):
+        return [f"{speed}. The final returns are a tie.", *sentences]
+    return [*sentences, f"{speed}."]
+
+
+def _alone(findings: Findings, mean: str) -> str:
+    """Returns how the only configuration ended, with its mean in words, and where it began."""
+    best = findings.results[0]
+    start = best.configuration.eval_return[0]
+    start = start[np.isfinite(start)]
+    gain = f", from {number(float(start.mean()))} before training" if start.size else ""
+    seeds = counted(len(best.final), "seed")
+    return f"{seeds} of {findings.experiment.env} ended with {mean}{gain}."
 
 
 def _ties(findings: Findings) -> list[Comparison]:
     """Returns the comparisons of the best with those that cannot be told from it."""
-    return [each for each in of_best(findings) if each.adjusted >= LEVEL]
+    return [pair for pair in of_best(findings) if pair.adjusted >= LEVEL]
 
 
 def _ahead(findings: Findings) -> Iterator[str]:
     """Yields by how much the best is ahead, and of which others that is not sure."""
-    against, pairs = of_best(findings), counted(len(findings.comparisons), "pair")
-    if not against:
+    pairs = of_best(findings)
+    if not pairs:
         return
-    next_best, ties = against[0], _ties(findings)
+    next_best = pairs[0]
     difference = float(next_best.difference.value)
-    above = f"is {number(difference)} above" if difference else "equals"
+    relation = f"is {number(difference)} above" if difference else "equals"
     yield (
-        f"The mean {above} that of the next, {findings.labels[next_best.second]} "
+        f"The mean {relation} that of the next, {findings.labels[next_best.second]} "
         f"({within(next_best.difference)}; {p_value(next_best.adjusted)} by the paired t-test, "
-        f"after Holm's correction for {pairs})."
+        f"after Holm's correction for {counted(len(findings.comparisons), 'pair')})."
     )
+    ties = _ties(findings)
     if ties:
-        least = p_value(min(each.adjusted for each in ties))
-        one, other = (findings.results[k].configuration.seed for k in ties[0][:2])
-        seeds, why = np.intersect1d(one, other).size, "chance often makes a difference as large"
-        if len(findings.comparisons) * 2.0 ** (1 - seeds) >= LEVEL:
-            why = f"{counted(seeds, 'seed')} are too few to tell"
-        least += "" if least == "p = 1" else " or more"
-        names = _listed([findings.labels[each.second] for each in ties])
-        yield f"The best cannot be told from {names}: {why} ({least})."
+        labels = _listed([findings.labels[pair.second] for pair in ties])
+        yield f"The best cannot be told from {labels}: {_why_a_tie(findings, ties)}."
+
+
+def _why_a_tie(findings: Findings, ties: list[Comparison]) -> str:
+    """Returns why the best is not surely better, and the least p value of those comparisons."""
+    first_seeds = findings.results[ties[0].first].configuration.seed
+    second_seeds = findings.results[ties[0].second].configuration.seed
+    num_seeds = np.intersect1d(first_seeds, second_seeds).size
+    reason = "chance often makes a difference as large"
+    # The least p value that so many seeds can have, all of one sign, times Holm's first factor.
+    if len(findings.comparisons) * 2.0 ** (1 - num_seeds) >= LEVEL:
+        reason = f"{counted(num_seeds, 'seed')} are too few to tell"
+    least = p_value(min(pair.adjusted for pair in ties))
+    if least != "p = 1":
+        least += " or more"
+    return f"{reason} ({least})"
 
 
 def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return ", ".join(names[:3]) + more
+    """Returns names with commas, and how many there are beyond three."""
+    text = ", ".join(names[:3])
+    if len(names) > 3:
+        text += f" and {len(names) - 3} more"
+    return text
 
 
 def _solving(findings: Findings) -> Iterator[str]:
+    """Yields how many seeds of the best solve the task at the end, if it has a threshold."""
     best = findings.results[0]
-    if best.solving is not None:
-        whose = "its " if len(findings.results) > 1 else ""
-        rate, fell = best.solving.rate, int(best.solving.fell.sum())
-        yield (
-            f"{best.solving.at_end:,} of {whose}{counted(len(best.final), 'seed')} solve the task "
-            f"at the end ({percent(float(rate.value))}, {within(rate, percent)}; solved is "
-            f"{solved(findings.experiment)})"
-            f"{f'; {fell:,} had solved it and fell back' if fell else ''}."
-        )
+    if best.solving is None:
+        return
+    seeds = counted(len(best.final), "seed")
+    # "Of 8 seeds" of a lone configuration; "of its 8 seeds" where others have seeds, too.
+    if len(findings.results) > 1:
+        seeds = f"its {seeds}"
+    rate = best.solving.rate
+    num_fallen = int(best.solving.fell.sum())
+    relapse = f"; {num_fallen:,} had solved it and fell back" if num_fallen else ""
+    yield (
+        f"{best.solving.at_end:,} of {seeds} solve the task at the end "
+        f"({percent(float(rate.value))}, {within(rate, percent)}; solved is "
+        f"{solved(findings.experiment)}){relapse}."
+    )
 
 
 def solved(experiment: Experiment) -> str:
@@ -153,15 +189,15 @@ def solved(experiment: Experiment) -> str:
 
 def two_ways(findings: Findings) -> str:
     """Returns what it means where the best has the higher mean and loses to another, or nothing."""
-    against = [
+    labels = [
         findings.labels[pair.second]
         for pair in of_best(findings)
         if pair.difference.value > 0 and pair.improvement.value < 0.5
     ]
-    if not against:
+    if not labels:
         return ""
     return (
-        f"The best has a higher mean than {_listed(against)}, but is better in less than half of "
+        f"The best has a higher mean than {_listed(labels)}, but is better in less than half of "
         "the pairs of seeds: it wins by more than it loses by. That is so where seeds fall in "
         "groups, such as those that fail and those that do not; the histograms show them."
     )
@@ -169,35 +205,49 @@ def two_ways(findings: Findings) -> str:
 
 def _few(findings: Findings) -> Iterator[str]:
     """Yields what few seeds would have said of the two best, where there are many seeds."""
-    best, second = (each.scores for each in findings.results[:2])
-    counts = [count for count in _COUNTS if 10 * count <= min(len(best), len(second))]
-    if counts and best.mean() != second.mean():
-        wrong = [f"{percent(wrong_winner(best, second, n))} of the time with {n}" for n in counts]
-        needed = seeds_needed(best, second)
-        found = f"{needed:,} seeds of each would" if needed else "10,000 seeds of each would not"
-        yield (
-            "With few seeds of the best and the next, the wrong one of these two would have won: "
-            f"{', '.join(wrong)}. {found} find the difference four times out of five, by Welch's "
-            "test, which does not pair seeds."
-        )
+    best, next_best = (result.scores for result in findings.results[:2])
+    # Draws stand for fresh seeds only where there are many more seeds than are drawn.
+    counts = [count for count in _COUNTS if 10 * count <= min(len(best), len(next_best))]
+    if not counts or best.mean() == next_best.mean():
+        return
+    shares = [f"{percent(wrong_winner(best, next_best, n))} of the time with {n}" for n in counts]
+    num_seeds = seeds_needed(best, next_best)
+    power = "10,000 seeds of each would not"
+    if num_seeds:
+        power = f"{num_seeds:,} seeds of each would"
+    yield (
+        "With few seeds of the best and the next, the wrong one of these two would have won: "
+        f"{', '.join(shares)}. {power} find the difference four times out of five, by Welch's "
+        "test, which does not pair seeds."
+    )
 
 
 def _speed(findings: Findings) -> str:
     """Returns what surely solves the task sooner than others, by the log-rank test, or nothing."""
-    names, order = findings.labels[:COMPARED], by_speed(findings.results[:COMPARED])
-    pairs = findings.speeds.items()
-    slower = [names[sum(pair) - order[0]] for pair, p in pairs if order[0] in pair and p < LEVEL]
-    if slower and len(slower) == len(names) - 1:
-        return f"The fastest is {names[order[0]]}"
-    return f"{names[order[0]]} is surely faster than {_listed(slower)}" if slower else ""
+    # Without a threshold, or a seed that reached it, there is no speed to test.
+    if not findings.speeds:
+        return ""
+    labels = findings.labels[:COMPARED]
+    fastest = by_speed(findings.results[:COMPARED])[0]
+    slower = [
+        labels[sum(pair) - fastest]  # the other place of the pair
+        for pair, p in findings.speeds.items()
+        if fastest in pair and p < LEVEL
+    ]
+    if not slower:
+        return ""
+    if len(slower) == len(labels) - 1:
+        return f"The fastest is {labels[fastest]}"
+    return f"{labels[fastest]} is surely faster than {_listed(slower)}"
 
 
 def caveats(findings: Findings) -> Iterator[str]:
     """Yields what to distrust in the headline, the gravest first."""
-    experiment, results = findings.experiment, findings.results
-    sizes = [len(each.final) for each in results]
-    for each in experiment.unfinished:
-        yield f"{each} is not finished. These are its results so far."
+    experiment = findings.experiment
+    results = findings.results
+    sizes = [len(result.final) for result in results]
+    for directory in experiment.unfinished:
+        yield f"{directory} is not finished. These are its results so far."
     for name in map(setting_in_words, experiment.disagree):
         yield f'The sources were made with different {name}: see "Where this comes from".'
     if min(sizes) < _FEW_SEEDS:
@@ -205,24 +255,28 @@ def caveats(findings: Findings) -> Iterator[str]:
             f"A configuration has {counted(min(sizes), 'seed')}: with fewer than {_FEW_SEEDS}, "
             "intervals hold the truth less than 95% of the time. Below six, there are none."
         )
+    # Of the configurations with an interval: how often it misses a group of three in ten.
     fewest = min(filter(enough, sizes), default=_FEW_SEEDS)
-    if (unseen := (1 - _GROUP) ** fewest) > _RARE:
+    unseen = (1 - _GROUP) ** fewest
+    if unseen > _RARE:
         yield (
             "Where returns fall in two groups far apart, an interval of so few seeds does not keep "
             f"its 95%: if three seeds in ten are of the other group, {fewest} seeds show none of "
             f"them {percent(unseen)} of the time, so the interval of the mean holds the truth at "
             f"most {percent(1 - unseen)} of the time."
         )
-    if failed := sum(int(np.sum(~np.isfinite(each.final))) for each in results):
+    num_failures = sum(int(np.sum(~np.isfinite(result.final))) for result in results)
+    if num_failures:
         yield (
-            f"{failed:,} of {counted(sum(sizes), 'seed')} ended with a return that is not finite. "
-            "They count as the worst finite return of all, which may flatter them."
+            f"{num_failures:,} of {counted(sum(sizes), 'seed')} ended with a return that is not "
+            "finite. They count as the worst finite return of all, which may flatter them."
         )
     if len(results) > 1:
         yield (
             f"The best of {len(results):,} was chosen by the same seeds that give its numbers, so "
             "these are a little too good. Train it with fresh seeds before you quote them."
         )
+        # Other tasks have no defaults of their own, which would suit one of the values better.
         names = " and ".join(map(setting_in_words, results[0].configuration.settings))
         if names and experiment.env in OF_TASKS:
             yield (
@@ -230,7 +284,8 @@ def caveats(findings: Findings) -> Iterator[str]:
                 "Tune them for each configuration before you choose."
             )
     yield from _edges(findings)
-    ends = [float(np.median(each.configuration.env_steps[-1])) for each in results]
+    # Seeds overshoot their budget by part of an update: that is no difference of budgets.
+    ends = [float(np.median(result.configuration.env_steps[-1])) for result in results]
     if max(ends) > 1.1 * min(ends):
         yield (
             f"Budgets differ: {steps(min(ends))} to {steps(max(ends))} env steps per seed. Each is "
@@ -244,19 +299,22 @@ def caveats(findings: Findings) -> Iterator[str]:
 def _edges(findings: Findings) -> Iterator[str]:
     """Yields the settings of the best that are the least or the greatest of three numbers."""
     for name, best in findings.results[0].configuration.settings.items():
-        values = ordered([each.configuration.settings.get(name) for each in findings.results])
+        values = ordered([result.configuration.settings.get(name) for result in findings.results])
         numbers = all(isinstance(x, int | float) and not isinstance(x, bool) for x in values)
+        # Of two values, either is at an edge.
         if numbers and len(values) > 2 and best in (values[0], values[-1]):
-            which = "least" if best == values[0] else "greatest"
+            edge = "least" if best == values[0] else "greatest"
             label = setting_in_words(name).capitalize()
-            yield f"{label} {say(best)} is the {which} tried: try beyond it."
+            yield f"{label} {say(best)} is the {edge} tried: try beyond it."
 
 
 def _rises(band: Estimate) -> bool:
     """Returns whether the last part of a curve is above what was before, by their intervals."""
-    known = np.flatnonzero(np.isfinite(band.value))
-    if len(known) < 5:
+    points = np.flatnonzero(np.isfinite(band.value))
+    if len(points) < 5:
         return False
-    before, last = known[int(0.85 * (len(known) - 1))], known[-1]
+    before = points[int(0.85 * (len(points) - 1))]
+    last = points[-1]
     rise = band.value[last] - band.value[before]
-    return bool(band.low[last] > band.high[before] and rise > 0.01 * np.ptp(band.value[known]))
+    # Intervals that lie apart may be ever so narrow: a rise of less than a percent is none.
+    return bool(band.low[last] > band.high[before] and rise > 0.01 * np.ptp(band.value[points]))

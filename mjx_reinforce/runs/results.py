@@ -14,7 +14,7 @@ import numpy as np
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.engine.checks import check_kind
 from mjx_reinforce.export.policy_files import Player, played_policy
-from mjx_reinforce.export.run_files import Which
+from mjx_reinforce.export.run_files import PolicyChoice
 from mjx_reinforce.files import Arrays, naming_damage, read_arrays, read_json
 from mjx_reinforce.learning.policy import Actor, Policy
 from mjx_reinforce.runs.design import Design, check_swept
@@ -82,7 +82,7 @@ class RunResults(NamedTuple):
         mean = float(np.mean(self.test_returns))
         return f"RunResults({self.config.env}, {len(self.test_returns)} seeds, return {mean:.4g})"
 
-    def player(self, seed: int | None = None, which: Which = "last") -> Player:
+    def player(self, seed: int | None = None, which: PolicyChoice = "last") -> Player:
         """Returns the policy of a seed, to play in Gymnasium or elsewhere.
 
         Args:

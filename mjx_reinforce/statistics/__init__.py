@@ -40,8 +40,10 @@ def alike(values: np.ndarray, size: Any = 0.0) -> np.ndarray:
       values: finite or -inf.
       size: [...] of the numbers that were rounded, where that is more than the values'.
     """
-    low, high = np.min(values, axis=-1), np.max(values, axis=-1)
+    low = np.min(values, axis=-1)
+    high = np.max(values, axis=-1)
     largest = np.maximum(np.maximum(np.abs(low), np.abs(high)), size)
+    # Where a value is -inf, the difference is inf or NaN, and never within the tolerance.
     with np.errstate(invalid="ignore"):  # where all failed
         return high - low <= np.finfo(np.float32).eps * np.where(largest < np.inf, largest, 0.0)
 
@@ -67,8 +69,9 @@ def iqm(values: np.ndarray, axis: int = -1) -> np.ndarray:
       >>> mr.iqm([0.0, 1.0, 2.0, 100.0]).item()  # the middle half
       1.5
     """
-    failed_first = np.where(np.isfinite(values), values, -np.inf)
-    ranked = np.sort(np.moveaxis(failed_first, axis, -1), axis=-1)
+    failures_lowest = np.where(np.isfinite(values), values, -np.inf)
+    ranked = np.sort(np.moveaxis(failures_lowest, axis, -1), axis=-1)
+    # Whole seeds, rounded down; failures are cut first, up to a quarter of all seeds.
     cut = int(_QUARTER * ranked.shape[-1])
     return finite_or_nan(ranked[..., cut : ranked.shape[-1] - cut].mean(axis=-1))
 
@@ -129,11 +132,15 @@ def _expanded_percentiles(
     ends = np.full((2, len(points)), np.nan)
     if enough(num_seeds, confidence):
         # Only means without trimming were seen to spread too little (interval_coverage.py).
-        shrinkage = 1.0 if cut else math.sqrt(1 - 1 / num_seeds)
+        shrinkage = 1.0
+        if not cut:
+            shrinkage = math.sqrt(1 - 1 / num_seeds)
         tail = expanded_tail(confidence, num_seeds - 1, shrinkage)
-        for first in range(0, len(points), _POINTS):
-            some = slice(first, first + _POINTS)
-            ends[:, some] = percentiles(resampled_trim_means(points[some], cut), tail)
+        # 5000 means of a point are 40 kB: the points of a large sweep come in blocks.
+        for start in range(0, len(points), _POINTS):
+            block = slice(start, start + _POINTS)
+            ends[:, block] = percentiles(resampled_trim_means(points[block], cut), tail)
+        # With this probability no seed of a sample shows that a share ``cut`` of all differs.
         if (1 - cut) ** num_seeds > 1 - confidence:
             ends[:, alike(points)] = np.nan
     low, high = finite_or_nan(ends).reshape(2, *shape)
@@ -165,11 +172,14 @@ def wilson(successes: ArrayLike, trials: ArrayLike, confidence: float = 0.95) ->
     """
     trials = np.asarray(trials)
     rate = np.asarray(successes) / trials
+    # The ends solve |rate - p| = z sqrt(p (1 - p) / trials) for p.
     z = -special.ndtri((1 - confidence) / 2)
     middle = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
     half = z * np.sqrt(rate * (1 - rate) / trials + (z / (2 * trials)) ** 2) / (1 + z**2 / trials)
+    # There the ends are 0 and 1 exactly, and rounding would leave them a little beside.
     low = np.where(rate == 0, 0.0, middle - half)[()]
-    return Estimate(rate, low, np.where(rate == 1, 1.0, middle + half)[()])
+    high = np.where(rate == 1, 1.0, middle + half)[()]
+    return Estimate(rate, low, high)
 
 
 def cvar(values: ArrayLike, fraction: float = 0.1) -> np.ndarray:
@@ -183,6 +193,7 @@ def cvar(values: ArrayLike, fraction: float = 0.1) -> np.ndarray:
     size = fraction * ordered.shape[-1]
     weights = np.clip(size - np.arange(math.ceil(size)), 0, 1) / size
     tail = ordered[..., : len(weights)]
+    # Differences from the last value have no rounding where all values are alike.
     with np.errstate(invalid="ignore"):  # of failed seeds
         return finite_or_nan(tail[..., -1] + (tail - tail[..., -1:]) @ weights)
 
@@ -208,8 +219,9 @@ def steps_to_solve(
     if threshold is None:
         return [None] * returns.shape[1]
     solved = returns >= threshold
-    first = np.argmax(solved, axis=0)
-    return [int(env_steps[e, s]) if solved[e, s] else None for s, e in enumerate(first)]
+    # 0 for a seed that never got there, too.
+    evaluation = np.argmax(solved, axis=0)
+    return [int(env_steps[e, s]) if solved[e, s] else None for s, e in enumerate(evaluation)]
 
 
 def summarize(history: dict[str, np.ndarray], threshold: float | None) -> dict[str, Any]:
@@ -231,15 +243,23 @@ def summarize(history: dict[str, np.ndarray], threshold: float | None) -> dict[s
     returns = history["eval_return"]
     final = returns[-1]
     low, high = iqm_interval(final)
-    solved = None if threshold is None else returns >= threshold
+    # The keys are there without a threshold, too, so that a program can rely on them.
+    counts: dict[str, Any] = dict.fromkeys(
+        ("seeds_solved_at_end", "seeds_ever_solved", "solve_rate")
+    )
+    if threshold is not None:
+        solved = returns >= threshold
+        counts = {
+            "seeds_solved_at_end": int(solved[-1].sum()),
+            "seeds_ever_solved": int(solved.any(axis=0).sum()),
+            "solve_rate": float(np.mean(solved[-1])),
+        }
     return {
         "final_returns": final.tolist(),
         "iqm": float(iqm(final)),
         "iqm_ci": [float(low), float(high)],
         "seeds_nonfinite_at_end": int(np.sum(~np.isfinite(final))),
-        "seeds_solved_at_end": None if solved is None else int(solved[-1].sum()),
-        "seeds_ever_solved": None if solved is None else int(solved.any(axis=0).sum()),
-        "solve_rate": None if solved is None else float(np.mean(solved[-1])),
+        **counts,
         "env_steps_to_solve": steps_to_solve(returns, history["env_steps"], threshold),
         "episodes_to_solve": steps_to_solve(returns, history["episodes"], threshold),
     }

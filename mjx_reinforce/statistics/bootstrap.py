@@ -24,12 +24,16 @@ def draws(num_seeds: int) -> np.ndarray:
     The draws are those of ``scipy.stats.bootstrap(..., rng=np.random.default_rng(0))``.
     """
     counts = np.empty((num_seeds, RESAMPLES), np.uint8)
-    random, at_once = np.random.default_rng(0), max(1, _DRAWS // num_seeds)
-    for first in range(0, RESAMPLES, at_once):
-        drawn = random.integers(0, num_seeds, (min(at_once, RESAMPLES - first), num_seeds))
+    random = np.random.default_rng(0)
+    block_size = max(1, _DRAWS // num_seeds)
+    # Blocks draw what one call would: the generator fills its arrays in the order of their rows.
+    for start in range(0, RESAMPLES, block_size):
+        drawn = random.integers(0, num_seeds, (min(block_size, RESAMPLES - start), num_seeds))
+        # Each resample counts in numbers of its own, so that one call counts all of the block.
         drawn += num_seeds * np.arange(len(drawn))[:, None]
-        found = np.bincount(drawn.ravel(), minlength=drawn.size).reshape(drawn.shape)
-        counts[:, first : first + len(drawn)] = found.T
+        seed_counts = np.bincount(drawn.ravel(), minlength=drawn.size).reshape(drawn.shape)
+        counts[:, start : start + len(drawn)] = seed_counts.T
+    # The cache hands the same array to everyone.
     counts.flags.writeable = False
     return counts
 
@@ -38,15 +42,16 @@ def draws(num_seeds: int) -> np.ndarray:
 def _draws_between(num_seeds: int, low: int, high: int) -> np.ndarray:
     """Returns how many draws of each rank are from the ``low``-th to before the ``high``-th."""
     counts = np.empty((num_seeds, RESAMPLES), np.uint8)
-    for some in _parts():
-        until = np.cumsum(draws(num_seeds)[:, some], axis=0, dtype=np.int32)
-        counts[:, some] = np.diff(np.clip(until, low, high), axis=0, prepend=low)
+    for block in _blocks():
+        # How many draws of a resample are of this seed or of lower ones, cut to the range.
+        until = np.cumsum(draws(num_seeds)[:, block], axis=0, dtype=np.int32)
+        counts[:, block] = np.diff(np.clip(until, low, high), axis=0, prepend=low)
     counts.flags.writeable = False
     return counts
 
 
-def _parts() -> list[slice]:
-    return [slice(first, first + _AT_ONCE) for first in range(0, RESAMPLES, _AT_ONCE)]
+def _blocks() -> list[slice]:
+    return [slice(start, start + _AT_ONCE) for start in range(0, RESAMPLES, _AT_ONCE)]
 
 
 def resampled_trim_means(values: np.ndarray, cut: float = 0.0) -> np.ndarray:
@@ -60,19 +65,22 @@ def resampled_trim_means(values: np.ndarray, cut: float = 0.0) -> np.ndarray:
       [P, 5000], -inf where a value of -inf is not trimmed.
     """
     num_seeds = values.shape[1]
-    trimmed = int(cut * num_seeds)
-    counts = _draws_between(num_seeds, trimmed, num_seeds - trimmed)
-    used = counts.any(axis=1)
+    num_trimmed = int(cut * num_seeds)
+    counts = _draws_between(num_seeds, num_trimmed, num_seeds - num_trimmed)
+    # The lowest and highest seeds may lie in no resample's range: the product leaves them out.
+    ranks = counts.any(axis=1)
     ordered = np.sort(values, axis=1)
     # Sums of how far values are above the middle one have no rounding where all equal it.
     middle = ordered[:, [num_seeds // 2]]
     middle = np.where(np.isneginf(middle), 0.0, middle)
-    above = np.where(np.isneginf(ordered), 0.0, ordered - middle)[:, used]
+    above = np.where(np.isneginf(ordered), 0.0, ordered - middle)[:, ranks]
     means = np.empty((len(values), RESAMPLES))
-    for some in _parts():
-        means[:, some] = above @ counts[used, some].astype(float)
-    means /= num_seeds - 2 * trimmed
+    for block in _blocks():
+        means[:, block] = above @ counts[ranks, block].astype(float)
+    means /= num_seeds - 2 * num_trimmed
     means += middle
+    # The product has 0 in place of -inf, which times 0 would be NaN. A mean is -inf if its lowest
+    # rank is.
     lowest = np.argmax(counts > 0, axis=0)
     means[lowest < np.sum(np.isneginf(ordered), axis=1, keepdims=True)] = -np.inf
     return means

@@ -76,19 +76,23 @@ def probability_of_improvement(
       >>> mr.probability_of_improvement([3.0, 4.0], [1.0, 2.0]).value.item()
       1.0
     """
-    x, y = worst_if_not_finite(x), worst_if_not_finite(y)
+    x = worst_if_not_finite(x)
+    y = worst_if_not_finite(y)
     of_x, of_y = _placements(x, y)
     rate = of_x.mean(axis=-1)
     if not paired:
         variance = _variance_of_mean(of_x) + _variance_of_mean(of_y)
     elif x.shape == y.shape:
+        # Of the sums, seed by seed: luck that both share is in their covariance.
         variance = _variance_of_mean(of_x + of_y)
     else:
         raise ValueError(f"paired values must be as many: {x.shape[-1]} and {y.shape[-1]} given")
     fewest = min(x.shape[-1], y.shape[-1])
-    known = (variance > 1e-20) & (rate > 0) & (rate < 1)  # which is more than rounding
-    known &= not paired or enough(fewest, confidence)
-    trials = np.where(known, rate * (1 - rate) / np.where(known, variance, 1), fewest)
+    # A variance of 1e-20 or less is rounding.
+    estimable = (variance > 1e-20) & (rate > 0) & (rate < 1)
+    estimable &= not paired or enough(fewest, confidence)
+    # A rate of n trials has the variance rate (1 - rate) / n, which is solved for n.
+    trials = np.where(estimable, rate * (1 - rate) / np.where(estimable, variance, 1), fewest)
     return wilson(rate * trials, trials, confidence)
 
 
@@ -99,18 +103,23 @@ def _variance_of_mean(values: np.ndarray) -> np.ndarray:
 
 def _placements(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the share of y below each of x [..., S] and of x above each of y [..., S']."""
-    together = stats.rankdata(np.concatenate([x, y], axis=-1), axis=-1)
-    sizes = x.shape[-1], y.shape[-1]
-    of_x = (together[..., : sizes[0]] - stats.rankdata(x, axis=-1)) / sizes[1]
-    of_y = (together[..., sizes[0] :] - stats.rankdata(y, axis=-1)) / sizes[0]
+    # A rank among all values, less the rank in the value's own group, counts the others below it.
+    # Ties have mean ranks, so that they count a half.
+    ranks = stats.rankdata(np.concatenate([x, y], axis=-1), axis=-1)
+    num_x = x.shape[-1]
+    num_y = y.shape[-1]
+    of_x = (ranks[..., :num_x] - stats.rankdata(x, axis=-1)) / num_y
+    of_y = (ranks[..., num_x:] - stats.rankdata(y, axis=-1)) / num_x
     return of_x, 1 - of_y
 
 
 def failures_as_worst(x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Returns x and y [..., S], the worst finite value of both for each that is not finite."""
-    x, y = np.asarray(x, float), np.asarray(y, float)
-    both = np.concatenate([x, y], axis=-1)
-    worst = np.min(both, axis=-1, keepdims=True, initial=np.inf, where=np.isfinite(both))
+    x = np.asarray(x, float)
+    y = np.asarray(y, float)
+    values = np.concatenate([x, y], axis=-1)
+    worst = np.min(values, axis=-1, keepdims=True, initial=np.inf, where=np.isfinite(values))
+    # Where all failed, the two are alike, whatever number stands for them.
     worst = np.where(np.isfinite(worst), worst, 0.0)
     return np.where(np.isfinite(x), x, worst), np.where(np.isfinite(y), y, worst)
 
@@ -153,15 +162,19 @@ def paired_difference(x: ArrayLike, y: ArrayLike, confidence: float = 0.95) -> D
     if np.shape(x) != np.shape(y):
         raise ValueError(f"paired values must be as many: {np.size(x)} and {np.size(y)} given")
     x, y = failures_as_worst(x, y)
-    difference, size = x - y, np.max(np.maximum(np.abs(x), np.abs(y)), axis=-1)
+    difference = x - y
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore", RuntimeWarning)  # of equal differences, for which see below
         test = stats.ttest_1samp(difference, 0, axis=-1)
         low, high = test.confidence_interval(confidence)
-    told_apart = np.sum(difference != 0, axis=-1)
-    p_value = np.maximum(np.nan_to_num(np.asarray(test[1])), np.minimum(2.0 ** (1 - told_apart), 1))
-    hidden = alike(difference, size) | (not enough(difference.shape[-1], confidence))
-    low, high = (np.where(hidden, np.nan, end)[()] for end in (low, high))
+    # NaN is the p value of equal differences: all pairs favor the same one, or all are ties.
+    num_unequal = np.sum(difference != 0, axis=-1)
+    least = np.minimum(2.0 ** (1 - num_unequal), 1)
+    p_value = np.maximum(np.nan_to_num(np.asarray(test[1])), least)
+    # Differences of large returns have the rounding of the returns.
+    size = np.max(np.maximum(np.abs(x), np.abs(y)), axis=-1)
+    undefined = alike(difference, size) | (not enough(difference.shape[-1], confidence))
+    low, high = (np.where(undefined, np.nan, end)[()] for end in (low, high))
     return Difference(difference.mean(axis=-1), low, high, p_value[()])
 
 
@@ -214,6 +227,7 @@ def holm(p_values: ArrayLike) -> np.ndarray:
     order = np.argsort(p_values)
     scaled = p_values[order] * np.arange(len(p_values), 0, -1)
     adjusted = np.empty_like(p_values)
+    # No p value may come out below that of a pair which is surer.
     adjusted[order] = np.minimum(np.maximum.accumulate(scaled), 1.0)
     return adjusted
 
@@ -240,11 +254,11 @@ def seeds_needed(
     x, y = _of_order_one(*failures_as_worst(x, y))
     if np.mean(x) == np.mean(y):
         return None
-    enough = np.flatnonzero(_power_by_seeds(x, y, alpha) >= power)
-    if len(enough):
-        return int(enough[0]) + 2
-    needed = _by_normal_approximation(x, y, power, alpha)
-    return needed if needed <= _MOST_SEEDS else None
+    sufficient = np.flatnonzero(_power_by_seeds(x, y, alpha) >= power)
+    if len(sufficient):
+        return int(sufficient[0]) + 2
+    num_seeds = _by_normal_approximation(x, y, power, alpha)
+    return num_seeds if num_seeds <= _MOST_SEEDS else None
 
 
 def _power_by_seeds(x: np.ndarray, y: np.ndarray, alpha: float) -> np.ndarray:
@@ -252,9 +266,12 @@ def _power_by_seeds(x: np.ndarray, y: np.ndarray, alpha: float) -> np.ndarray:
     random = np.random.default_rng(0)
     count = np.arange(2, _DRAWN_SEEDS + 1)
     middle = np.mean(x)
-    means, variances = [], []
+    means = []
+    variances = []
     for values in (x, y):
+        # About the middle, so that a sum of squares less a square of sums keeps its digits.
         drawn = values[random.integers(0, len(values), (_EXPERIMENTS, _DRAWN_SEEDS))] - middle
+        # An experiment of n seeds is the first n draws of a row: one set of draws for all n.
         sums, squares = (np.cumsum(power, axis=1)[:, 1:] for power in (drawn, drawn**2))
         means.append(sums / count)
         spread = np.maximum(squares - sums**2 / count, 0)
@@ -263,6 +280,7 @@ def _power_by_seeds(x: np.ndarray, y: np.ndarray, alpha: float) -> np.ndarray:
     with np.errstate(invalid="ignore", divide="ignore"):
         freedom = (count - 1) * sum(variances) ** 2 / (variances[0] ** 2 + variances[1] ** 2)
         t = difference / np.sqrt(sum(variances))
+    # Student's quantile takes long for a million numbers; it is smooth between whole ones.
     degrees = np.arange(1, 2 * _DRAWN_SEEDS)
     freedom = np.where(np.isnan(freedom), 1.0, freedom)  # where nothing varies
     critical = np.interp(freedom, degrees, stats.t.isf(alpha / 2, degrees))
@@ -294,5 +312,8 @@ def wrong_winner(x: ArrayLike, y: ArrayLike, num_seeds: int, draws: int = 10_000
     random = np.random.default_rng(0)
     drawn = [v[random.integers(0, len(v), (draws, num_seeds))] for v in (x, y)]
     truth = np.sign(np.mean(x) - np.mean(y))
-    found = np.sign(np.subtract(*(values.mean(axis=1) for values in drawn)))
-    return float(np.mean(1 - found * truth) / 2) if truth else math.nan
+    if not truth:
+        return math.nan
+    # 1 where the draw agrees, -1 where it does not, 0 without a winner.
+    agreement = np.sign(drawn[0].mean(axis=1) - drawn[1].mean(axis=1)) * truth
+    return float(np.mean(1 - agreement) / 2)

@@ -72,9 +72,11 @@ def kaplan_meier(steps: ArrayLike, solved: ArrayLike, confidence: float = 0.95) 
       >>> curve.probability.round(2).tolist()
       [0.67, 0.33, 0.33]
     """
-    steps, solved = np.asarray(steps, float), np.asarray(solved, bool)
+    steps = np.asarray(steps, float)
+    solved = np.asarray(solved, bool)
     survival = stats.ecdf(stats.CensoredData(uncensored=steps[solved], right=steps[~solved])).sf
     with warnings.catch_warnings():
+        # Where all seeds are left, or none: NaN says so.
         warnings.filterwarnings("ignore", "The confidence interval is undefined", RuntimeWarning)
         band = survival.confidence_interval(confidence, method="log-log")
     return Survival(
@@ -97,9 +99,10 @@ def median_steps(steps: ArrayLike, solved: ArrayLike, confidence: float = 0.95) 
       Env steps. NaN where half of the seeds never solved it; so is an end of the interval that
       the data do not bound, as both of too few seeds.
     """
-    curve, half = kaplan_meier(steps, solved, confidence), _half_solved(steps, solved)
+    half = _half_solved(steps, solved)
     if not enough(np.size(steps), confidence):
         return Estimate(half, np.nan, np.nan)
+    curve = kaplan_meier(steps, solved, confidence)
     # Where an end is not defined, all seeds are left, or none is. Else it is no fraction, so that
     # rounding decides nothing.
     ends = (np.where(np.isnan(x), curve.probability, x) <= 0.5 for x in (curve.low, curve.high))
@@ -128,20 +131,25 @@ def restricted_mean(
     Raises:
       ValueError: no seed was trained for so long.
     """
-    steps, solved = np.asarray(steps, float), np.asarray(solved, bool)
+    steps = np.asarray(steps, float)
+    solved = np.asarray(solved, bool)
     if until > steps.max() and not solved.all():
         raise ValueError(f"until: {until:,} env steps, but the longest seed has {steps.max():,.0f}")
     survival = stats.ecdf(stats.CensoredData(uncensored=steps[solved], right=steps[~solved])).sf
+    # The curve is a staircase; clipped, its steps beyond ``until`` have no width.
     edges = np.clip(np.concatenate([[0], survival.quantiles, [until]]), 0, until)
     areas = np.diff(edges) * np.concatenate([[1.0], survival.probabilities])
     after = np.cumsum(areas[:0:-1])[::-1]  # the area after each of the steps
     at_risk = np.sum(steps >= survival.quantiles[:, None], axis=1)
     events = np.sum(steps[solved] == survival.quantiles[:, None], axis=1)
-    left = at_risk - events
-    terms = after**2 * events / (at_risk * np.where(left > 0, left, 1))
-    num_seeds, value = len(steps), float(areas.sum())
+    # Greenwood's terms. After the last seed the area is 0, and 1 avoids 0 / 0.
+    survivors = at_risk - events
+    terms = after**2 * events / (at_risk * np.where(survivors > 0, survivors, 1))
+    num_seeds = len(steps)
+    value = float(areas.sum())
     if not (enough(num_seeds, confidence) and terms.any()):
         return Estimate(value, np.nan, np.nan)
+    # By n - 1, as the variance of a sample, which it is without censoring.
     error = np.sqrt(terms.sum() * num_seeds / (num_seeds - 1))
     half = float(stats.t.isf((1 - confidence) / 2, num_seeds - 1) * error)
     return Estimate(value, max(value - half, 0.0), min(value + half, until))
@@ -182,11 +190,13 @@ def log_rank(
       True
     """
     groups = []
-    for some, done in ((steps, solved), (other_steps, other_solved)):
-        some, done = np.asarray(some, float), np.asarray(done, bool)
-        groups.append(stats.CensoredData(uncensored=some[done], right=some[~done]))
+    for times, events in ((steps, solved), (other_steps, other_solved)):
+        times = np.asarray(times, float)
+        events = np.asarray(events, bool)
+        groups.append(stats.CensoredData(uncensored=times[events], right=times[~events]))
     with np.errstate(invalid="ignore"):  # without a difference to see, the statistic is 0 / 0
         test = stats.logrank(*groups)
+    # The normal approximation is too sure of few seeds: it may not go beyond their orders.
     most = stats.norm.isf(least_p(np.size(steps), np.size(other_steps)) / 2)
     statistic = float(np.clip(np.nan_to_num(test.statistic), -most, most))
     return LogRank(statistic, float(2 * stats.norm.sf(abs(statistic))))
@@ -208,13 +218,15 @@ def mean_while_training(eval_return: np.ndarray, env_steps: np.ndarray, until: f
     means = []
     for returns, steps in zip(eval_return.T, np.asarray(env_steps, float).T, strict=True):
         moved = np.diff(steps, prepend=-1) > 0  # a seed that stands still keeps its value
-        returns, steps = returns[moved], steps[moved]
+        steps = steps[moved]
+        returns = returns[moved]
         end = min(max(until, steps[0]), steps[-1])
+        # The corners of the curve before the end, and the point at which it is cut off.
         inside = steps < end
-        at = np.append(steps[inside], end)
+        corners = np.append(steps[inside], end)
         heights = np.append(returns[inside], np.interp(end, steps, returns))
-        width = at[-1] - at[0]
-        means.append(np.trapezoid(heights, at) / width if width else heights[0])
+        width = corners[-1] - corners[0]
+        means.append(np.trapezoid(heights, corners) / width if width else heights[0])
     return np.array(means)
 
 
@@ -224,19 +236,23 @@ def _half_solved(steps: ArrayLike, solved: ArrayLike) -> float:
     The share that is left is counted in whole numbers: the product of fractions that scipy rounds
     may come out above a half where it is one.
     """
-    steps, solved = np.asarray(steps, float), np.asarray(solved, bool)
+    steps = np.asarray(steps, float)
+    solved = np.asarray(solved, bool)
     times, events = np.unique(steps[solved], return_counts=True)
     at_risk = len(steps) - np.searchsorted(np.sort(steps), times)
-    left = 1
-    total = 1
-    for time, risk, solving in zip(times.tolist(), at_risk.tolist(), events.tolist(), strict=True):
-        left *= risk - solving
-        total *= risk
-        if 2 * left <= total:
+    # The share is numerator / denominator, in Python's integers, which have no end.
+    numerator = 1
+    denominator = 1
+    for time, risk, count in zip(times.tolist(), at_risk.tolist(), events.tolist(), strict=True):
+        numerator *= risk - count
+        denominator *= risk
+        if 2 * numerator <= denominator:
             return time
     return float("nan")
 
 
 def _first(steps: np.ndarray, holds: np.ndarray) -> float:
     """Returns the first of the steps at which something holds, NaN if it never does."""
-    return float(steps[holds.argmax()]) if holds.any() else float("nan")
+    if not holds.any():
+        return float("nan")
+    return float(steps[holds.argmax()])

@@ -215,7 +215,7 @@ def last_actors(config: Config, policy: Mapping[str, Any]) -> Actor:
     assert config.init_from is not None
     directory = Path(config.init_from)
     run = read_run(directory)
-    saved = read_policy(policy_folder(run, "last"), own=config.policy)
+    saved = read_policy(policy_folder(run, "last"), trusted_code=config.policy)
     for name, value in policy.items():
         old = saved.settings.get(name, value)
         if name not in _DRAWN and old != value:

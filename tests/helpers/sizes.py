@@ -26,6 +26,11 @@ def code(path):
     if path.suffix != ".py":
         lines = re.sub(r"/\*.*?\*/|//[^\n]*", "", text, flags=re.DOTALL).splitlines()
         return sum(bool(line.strip()) for line in lines)
+    return len(code_lines(text))
+
+
+def code_lines(text):
+    """Returns the numbers of the lines of Python that are code."""
     lines = {
         number
         for token in tokenize.generate_tokens(io.StringIO(text).readline)
@@ -36,7 +41,7 @@ def code(path):
         docstring = _docstring(node)
         if docstring is not None:
             lines -= set(range(docstring.lineno, docstring.end_lineno + 1))
-    return len(lines)
+    return lines
 
 
 def _docstring(node):
@@ -45,16 +50,21 @@ def _docstring(node):
     return node.body[0] if documented and ast.get_docstring(node) else None
 
 
+def package_files(root, *suffixes):
+    """Returns the files of the package and the environments whose names end so."""
+    return [
+        path
+        for folder in ("mjx_reinforce", "envs")
+        for path in sorted((root / folder).rglob("*"))
+        if path.suffix in suffixes
+        and "mjx_reinforce/envs/" not in path.as_posix()  # a link to the folder at the top
+    ]
+
+
 def sizes(root):
     """Returns each size by its name."""
     parts = {
-        "package": [
-            path
-            for folder in ("mjx_reinforce", "envs")
-            for path in (root / folder).rglob("*")
-            if path.suffix in (".py", ".h")
-            and "mjx_reinforce/envs/" not in path.as_posix()  # a link to the folder at the top
-        ],
+        "package": package_files(root, ".py", ".h"),
         "experiments": [*(root / "experiments").rglob("*.py")],
         "tests": [*(root / "tests").rglob("*.py")],
     }

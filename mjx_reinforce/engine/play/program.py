@@ -68,7 +68,7 @@ def step_function(
       env: what is played.
       act: (actor, observation [O]) -> outputs of the distribution.
       distribution: the family whose parameters the outputs are.
-      length: steps whose noise is drawn with one key, as ``chunks.play_chunks`` does.
+      length: steps whose noise is drawn with one key, as ``episode.play_chunks`` does.
     """
     leaves, tree = jax.tree.flatten(base.shapes(env.reset, jax.random.key(0)))
     drawn = jax.eval_shape(lambda: distribution.noise(jax.random.key(0), ()))

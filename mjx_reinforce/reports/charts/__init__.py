@@ -35,7 +35,8 @@ _LOOK = json.loads(
 )
 #: Colors by name. Those of the configurations are Okabe and Ito's, told apart by color-blind
 #: people (https://jfly.uni-koeln.de/color/), without their yellow, which is lost on white.
-LIGHT, DARK = _LOOK["light"], _LOOK["dark"]
+LIGHT = _LOOK["light"]
+DARK = _LOOK["dark"]
 #: How all charts look, for Vega-Lite.
 CONFIG = _LOOK["config"]
 _NUM_COLORS = sum(name.startswith("series-") for name in LIGHT)
@@ -59,9 +60,9 @@ def in_light(text: str) -> str:
     return re.sub(r"var\(--([\w-]+)\)", lambda name: LIGHT[name[1]], text)
 
 
-def quantity(field: str, **more: Any) -> Spec:
-    """Returns a channel that shows a number."""
-    return {"field": field, "type": "quantitative", **more}
+def quantity(field: str, **properties: Any) -> Spec:
+    """Returns a channel that shows a number, with further properties of the channel."""
+    return {"field": field, "type": "quantitative", **properties}
 
 
 def layer(mark: str, encoding: Spec, **look: Any) -> Spec:
@@ -84,10 +85,11 @@ _ONCE = {"values": [{}]}
 def rows(table: Table, labels: Sequence[str]) -> list[dict[str, Any]]:
     """Returns a table row by row, with the labels of its configurations."""
     names = list(table)
-    listed = [dict(zip(names, row, strict=True)) for row in zip(*table.values(), strict=True)]
+    records = [dict(zip(names, row, strict=True)) for row in zip(*table.values(), strict=True)]
+    # Tables hold places, so that a page has each label, which may be long, only once.
     if "configuration" in table:
-        return [row | {"configuration": labels[row["configuration"]]} for row in listed]
-    return listed
+        return [row | {"configuration": labels[row["configuration"]]} for row in records]
+    return records
 
 
 #: Floats beyond have no fractions.
@@ -96,29 +98,39 @@ _SHORT = 2.0**53
 
 def short(values: ArrayLike, digits: int = 5) -> list[Any]:
     """Returns numbers with a few digits, None where they are not finite."""
-    flat = np.asarray(values, float).ravel().tolist()
-    return [_integer(float(f"{x:.{digits}g}")) if math.isfinite(x) else None for x in flat]
+    return [_short_number(x, digits) for x in np.asarray(values, float).ravel().tolist()]
 
 
-def _integer(value: float) -> float | int:
-    """Returns an int where it is short; the drawing program reads none beyond 64 bits."""
-    return int(value) if value.is_integer() and abs(value) < _SHORT else value
+def _short_number(value: float, digits: int) -> float | int | None:
+    """Returns a number with a few digits, as an int where it is whole, None for NaN."""
+    # JSON has neither NaN nor infinity; Vega-Lite leaves a mark out where a value is null.
+    if not math.isfinite(value):
+        return None
+    rounded = float(f"{value:.{digits}g}")
+    # The drawing program reads no int beyond 64 bits.
+    if rounded.is_integer() and abs(rounded) < _SHORT:
+        return int(rounded)
+    return rounded
 
 
 def means(results: Sequence[Result]) -> Table:
     """Returns the mean final return of results, and the ends of its interval."""
-    return {x: short([getattr(each.mean, x) for each in results]) for x in Estimate._fields}
+    return {
+        field: short([getattr(result.mean, field) for result in results])
+        for field in Estimate._fields
+    }
 
 
 def stacked(parts: Iterable[Mapping[str, Any]]) -> Table:
     """Returns tables below each other; what is no list in one is the same in all of its rows."""
     table: Table = {}
     for part in parts:
+        # Every part has one list at least, which says how many rows its constants fill.
         length = next(len(x) for x in part.values() if isinstance(x, list))
         for name, values in part.items():
-            table.setdefault(name, []).extend(
-                values if isinstance(values, list) else [values] * length
-            )
+            if not isinstance(values, list):
+                values = [values] * length
+            table.setdefault(name, []).extend(values)
     return table
 
 
@@ -158,7 +170,9 @@ def make_chart(findings: Findings, layers: Sequence[Spec], height: int, **fields
       height: in pixels.
       **fields: of ``Chart``, but for ``spec``.
     """
-    at_first = {
+    # The page's controls set these parameters. Their values here are what a picture shows, and the
+    # page before anybody touches it: the best few, at the end.
+    parameters = {
         "shown": findings.labels[:SHOWN],
         "at": float(findings.grid[-1]),
         "moment": len(slider_stops(findings)) - 1,
@@ -168,9 +182,10 @@ def make_chart(findings: Findings, layers: Sequence[Spec], height: int, **fields
         "$schema": "https://vega.github.io/schema/vega-lite/v6.json",
         "description": fields["alt"],
         "config": CONFIG,
-        "params": [{"name": name, "value": value} for name, value in at_first.items()],
+        "params": [{"name": name, "value": value} for name, value in parameters.items()],
         "width": "container",
         "height": height,
+        # The page's figures are as wide as the window: only the width follows.
         "autosize": {"type": "fit-x", "contains": "padding"},
         "layer": layers,
     }
@@ -182,9 +197,11 @@ def render_chart(chart: Chart, labels: Sequence[str], title: str) -> dict[str, b
     import vl_convert
 
     datasets = {name: rows(table, labels) for name, table in chart.data.items()}
-    whole = chart.spec | {"datasets": datasets, "width": 720, "background": "var(--paper)"}
-    whole["title"] = {"text": title, "anchor": "start", "color": "var(--ink)", "offset": 14}
-    svg = vl_convert.vegalite_to_svg(json.loads(in_light(json.dumps(whole))))
+    # A file stands by itself: it has its data, a width in pixels, a title and a ground.
+    spec = chart.spec | {"datasets": datasets, "width": 720, "background": "var(--paper)"}
+    spec["title"] = {"text": title, "anchor": "start", "color": "var(--ink)", "offset": 14}
+    svg = vl_convert.vegalite_to_svg(json.loads(in_light(json.dumps(spec))))
+    # Two pixels for each of the drawing's, for screens and print that are finer.
     return {"png": vl_convert.svg_to_png(svg, scale=2), "svg": svg.encode()}
 
 
@@ -196,17 +213,20 @@ def slider_stops(findings: Findings) -> list[int]:
 
 def tooltip(**fields: tuple[str, str]) -> list[Spec]:
     """Returns what is said where one points: the configuration, and fields by name and format."""
-    said = fields.items()
-    return [_CONFIGURATION, *(quantity(x, title=name, format=form) for x, (name, form) in said)]
+    channels = [
+        quantity(field, title=title, format=form) for field, (title, form) in fields.items()
+    ]
+    return [_CONFIGURATION, *channels]
 
 
-def shown_rows(data: str, *more: Spec) -> Spec:
-    """Returns the rows that are shown, after ``more`` transforms; a log axis has no place for 0."""
-    filters = (
-        "indexof(shown, datum.configuration) >= 0",
-        "!logarithmic || !(datum.env_steps <= 0)",
-    )
-    return {"data": {"name": data}, "transform": [*({"filter": test} for test in filters), *more]}
+def shown_rows(data: str, *transforms: Spec) -> Spec:
+    """Returns the rows that are shown, before further transforms; a log axis has no place for 0."""
+    filters = [
+        {"filter": "indexof(shown, datum.configuration) >= 0"},
+        # Not `> 0`: a table without env steps has no value to compare, and keeps its rows.
+        {"filter": "!logarithmic || !(datum.env_steps <= 0)"},
+    ]
+    return {"data": {"name": data}, "transform": [*filters, *transforms]}
 
 
 def series(labels: Sequence[str], *, legend: bool = True) -> Spec:
@@ -225,16 +245,16 @@ def _by_place(labels: Sequence[str], looks: Sequence[Any], *, legend: bool = Tru
     It has as many columns as the page has room for. Not as the chart has: that is narrowed to leave
     room for the axis once the legend is laid out.
     """
-    column = min(7 * max(map(len, labels)), CONFIG["legend"]["labelLimit"]) + 50
-    columns = f"max(1, floor((width && containerSize()[0] || width) / {column}))"
-    place = {"title": None, "orient": "top", "direction": "horizontal", "offset": 36}
-    place |= {"columns": {"expr": columns}, "values": {"expr": "shown"}}
-    look = {"symbolType": "stroke", "symbolOpacity": 1, "labelFontSize": 12}
-    return {
-        **_CONFIGURATION,
-        "scale": {"domain": list(labels), "range": list(looks)},
-        "legend": place | look if legend and len(labels) > 1 else None,
-    }
+    layout = None
+    if legend and len(labels) > 1:
+        # A letter is about 7 pixels wide; 50 more hold the stroke and the gap to the next column.
+        column = min(7 * max(map(len, labels)), CONFIG["legend"]["labelLimit"]) + 50
+        columns = f"max(1, floor((width && containerSize()[0] || width) / {column}))"
+        layout = {"title": None, "orient": "top", "direction": "horizontal", "offset": 36}
+        layout |= {"columns": {"expr": columns}, "values": {"expr": "shown"}}
+        layout |= {"symbolType": "stroke", "symbolOpacity": 1, "labelFontSize": 12}
+    scale = {"domain": list(labels), "range": list(looks)}
+    return {**_CONFIGURATION, "scale": scale, "legend": layout}
 
 
 def moment_line(findings: Findings) -> Spec:
@@ -244,6 +264,7 @@ def moment_line(findings: Findings) -> Spec:
         "data": _ONCE,
         "transform": [
             {"calculate": "at", "as": "env_steps"},
+            # At 0 a logarithmic axis could not draw it either.
             {"filter": f"datum.env_steps < {end} && datum.env_steps > 0"},
         ],
         **layer("rule", {"x": quantity("env_steps")}, strokeDash=[2, 3]),
@@ -255,14 +276,17 @@ def threshold_line(findings: Findings, axis: str, drawn: np.ndarray) -> list[Spe
 
     There is none beyond the returns that are drawn: axes end where the data do.
     """
-    threshold, known = findings.experiment.threshold, drawn[np.isfinite(drawn)]
-    if threshold is None or not known.size or not known.min() <= threshold <= known.max():
+    threshold = findings.experiment.threshold
+    finite = drawn[np.isfinite(drawn)]
+    if threshold is None or not finite.size or not finite.min() <= threshold <= finite.max():
         return []
     # Below the line, at its end: curves come from below and end above.
-    at_end, look = {"x": {"value": {"expr": "width - 4"}}}, {"baseline": "top", "dy": 5}
+    position = {"x": {"value": {"expr": "width - 4"}}}
+    look = {"baseline": "top", "dy": 5}
     if axis == "x":
-        at_end, look = {"y": {"value": {"expr": "height - 5"}}}, {"baseline": "bottom", "dx": -5}
+        position = {"y": {"value": {"expr": "height - 5"}}}
+        look = {"baseline": "bottom", "dx": -5}
     rule = {"mark": {"type": "rule", "strokeDash": [6, 4], "opacity": 0.8}}
-    name = {**at_end, "text": {"value": "solved"}}
-    said = layer("text", name, align="right", color="var(--soft)", **look)
-    return [{"data": _ONCE, "encoding": {axis: {"datum": threshold}}, "layer": [rule, said]}]
+    label_encoding = {**position, "text": {"value": "solved"}}
+    label = layer("text", label_encoding, align="right", color="var(--soft)", **look)
+    return [{"data": _ONCE, "encoding": {axis: {"datum": threshold}}, "layer": [rule, label]}]

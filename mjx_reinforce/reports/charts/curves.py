@@ -20,12 +20,15 @@ _RETURN = "return of the deterministic policy"
 
 def draw(findings: Findings) -> Iterator[charts.Chart]:
     """Yields the chart."""
-    threshold, beyond = findings.experiment.threshold, ""
-    returns = [each.configuration.eval_return.ravel() for each in findings.results]
+    threshold = findings.experiment.threshold
+    returns = [result.configuration.eval_return.ravel() for result in findings.results]
     solved = charts.threshold_line(findings, "y", np.concatenate(returns))
+    # Who looks for the line has to be told why there is none.
+    beyond = ""
     if threshold is not None and not solved:
         beyond = f" The return that counts as solved, {number(threshold)}, lies beyond the figure."
     layers = [
+        # Single seeds lie below the band, which would be hidden by hundreds of them.
         {
             "encoding": {"x": charts.STEPS, "color": charts.series(findings.labels)},
             "layer": [_lines_of_seeds(), _band_and_line(findings)],
@@ -34,9 +37,11 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         *solved,
     ]
     bands = _bands(findings)
-    band = ", and its 95% bootstrap interval" * charts.has_width(bands)
-    alone = "" if len(findings.results) == 1 else "With one configuration shown, "
-    lines = f"{alone}thin lines are single seeds, from worst to best."
+    interval = ", and its 95% bootstrap interval" if charts.has_width(bands) else ""
+    lines = "Thin lines are single seeds, from worst to best."
+    if len(findings.results) > 1:
+        # Seeds of several would cover each other: `_lines_of_seeds` draws those of one alone.
+        lines = "With one configuration shown, thin lines are single seeds, from worst to best."
     yield charts.make_chart(
         findings,
         layers,
@@ -44,8 +49,8 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         name="curves",
         title="Learning curves",
         caption=(
-            f"The interquartile mean over seeds of the return without exploration{band}. "
-            f"{lines[0].upper()}{lines[1:]} Point at a curve to read it.{beyond}"
+            f"The interquartile mean over seeds of the return without exploration{interval}. "
+            f"{lines} Point at a curve to read it.{beyond}"
         ),
         alt="Return over env steps, a line for each configuration that is shown.",
         data={"curves": bands, "seeds": _seeds(findings)},
@@ -63,22 +68,30 @@ def picture(env: str, threshold: float | None, history: dict[str, np.ndarray]) -
     """
     from matplotlib.figure import Figure
 
-    returns, steps = history["eval_return"], history["env_steps"]
+    returns = history["eval_return"]
+    steps = history["env_steps"]
+    num_seeds = returns.shape[1]
+    # The mean ends where the first seed does: beyond, it would be of other seeds.
     grid = np.linspace(0, steps[-1].min(), 200)
-    curves, seeds = on_grid(grid, steps, returns), returns.shape[1]
+    curves = on_grid(grid, steps, returns)
     figure = Figure(figsize=(8, 4.5), dpi=150, layout="constrained")
     axes = figure.subplots()
-    axes.plot(steps, returns, color="tab:blue", linewidth=0.7, alpha=max(0.03, min(0.5, 4 / seeds)))
+    # The more seeds, the paler each: lines that lie on one another add up.
+    opacity = max(0.03, min(0.5, 4 / num_seeds))
+    axes.plot(steps, returns, color="tab:blue", linewidth=0.7, alpha=opacity)
     axes.plot(grid, iqm(curves), color="tab:blue", linewidth=2)
-    if seeds > 1:
+    title = "1 seed"
+    if num_seeds > 1:
+        title = f"interquartile mean of {num_seeds} seeds"
         axes.fill_between(grid, *iqm_interval(curves), color="tab:blue", alpha=0.25, linewidth=0)
-    known = returns[np.isfinite(returns)]
-    if threshold is not None and known.size and known.min() <= threshold <= known.max():
+    if enough(num_seeds):
+        title += " and its 95% interval"
+    # A threshold far away would press the curves into a corner.
+    finite = returns[np.isfinite(returns)]
+    if threshold is not None and finite.size and finite.min() <= threshold <= finite.max():
         axes.axhline(threshold, color="0.3", linestyle="--", linewidth=1, label="solved")
         axes.legend(frameon=False)
-    shown = f"interquartile mean of {seeds} seeds" if seeds > 1 else "1 seed"
-    shown += " and its 95% interval" if enough(seeds) else ""
-    axes.set(title=f"{env}: {shown}", xlabel="env steps per seed", ylabel=_RETURN)
+    axes.set(title=f"{env}: {title}", xlabel="env steps per seed", ylabel=_RETURN)
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.grid(alpha=0.3)
     file = io.BytesIO()
@@ -103,15 +116,16 @@ def _band_and_line(findings: Findings) -> charts.Spec:
     band = {"y": _return("low"), "y2": {"field": "high"}}
     mean = {"y": _return("value"), "strokeDash": charts.dashes(findings.labels)}
     near = {"type": "point", "on": "pointerover", "fields": ["env_steps"], "nearest": True}
-    seen = {"condition": {"param": "near", "empty": False, "value": 1}, "value": 0}
+    # All points are there for the pointer to find, but only the nearest is seen.
+    opacity = {"condition": {"param": "near", "empty": False, "value": 1}, "value": 0}
     # Vega-Lite leaves words out of a nearest point's tooltip, unless all data are in it.
-    said = {"size": 70, "filled": True, "tooltip": {"content": "data"}}
+    look = {"size": 70, "filled": True, "tooltip": {"content": "data"}}
     return charts.shown_rows("curves") | {
         "layer": [
             charts.layer("area", band, opacity=0.18, clip=True),
             charts.layer("line", mean, strokeWidth=2.2, clip=True),
             {
-                **charts.layer("point", {"y": _return("value"), "opacity": seen}, **said),
+                **charts.layer("point", {"y": _return("value"), "opacity": opacity}, **look),
                 "params": [{"name": "near", "select": near}],
             },
         ]
@@ -119,32 +133,38 @@ def _band_and_line(findings: Findings) -> charts.Spec:
 
 
 def _bands(findings: Findings) -> Table:
-    def part(place: int, result: Result) -> dict[str, Any]:
-        known = np.isfinite(result.band.value)
+    """Returns the interquartile mean and its interval over env steps, of each configuration."""
+
+    def band_rows(place: int, result: Result) -> dict[str, Any]:
+        """Returns one configuration's, without the points at which it has no mean."""
+        finite = np.isfinite(result.band.value)
         return {
             "configuration": place,
-            "env_steps": short(findings.grid[known], 7),
-            **{name: short(getattr(result.band, name)[known]) for name in result.band._fields},
+            "env_steps": short(findings.grid[finite], 7),
+            **{name: short(getattr(result.band, name)[finite]) for name in result.band._fields},
         }
 
-    return stacked(part(place, result) for place, result in enumerate(findings.results))
+    return stacked(band_rows(place, result) for place, result in enumerate(findings.results))
 
 
 def _seeds(findings: Findings) -> Table:
     """Returns some curves of each configuration: from the worst seed to the best, evenly."""
+    # So many of each that a page of a large sweep stays small, but five at least.
     most = max(5, min(_DRAWN_OF_ONE, _DRAWN_OF_ALL // len(findings.results)))
 
-    def parts() -> Iterator[dict[str, Any]]:
+    def seed_rows() -> Iterator[dict[str, Any]]:
+        """Yields a table of each seed that is drawn."""
         for place, result in enumerate(findings.results):
             ranked = from_the_worst(result)
-            chosen = np.unique(np.linspace(0, len(ranked) - 1, min(most, len(ranked))).round())
-            for s in ranked[chosen.astype(int)]:
-                known = np.isfinite(result.seeds[:, s])
+            ranks = np.linspace(0, len(ranked) - 1, min(most, len(ranked))).round()
+            for s in ranked[np.unique(ranks).astype(int)]:
+                # A curve has gaps where its seed broke, and ends at its own budget.
+                finite = np.isfinite(result.seeds[:, s])
                 yield {
                     "configuration": place,
                     "seed": int(result.configuration.seed[s]),
-                    "env_steps": short(findings.grid[known], 7),
-                    "value": short(result.seeds[known, s], 4),
+                    "env_steps": short(findings.grid[finite], 7),
+                    "value": short(result.seeds[finite, s], 4),
                 }
 
-    return stacked(parts())
+    return stacked(seed_rows())

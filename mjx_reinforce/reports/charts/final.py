@@ -13,13 +13,15 @@ from mjx_reinforce.reports.words import number, within
 
 def draw(findings: Findings) -> Iterator[charts.Chart]:
     """Yields the chart; none of one configuration alone."""
-    results, best = findings.results, findings.results[0]
+    results = findings.results
+    best = results[0]
     if len(results) == 1:
         return
     places = list(range(len(results)))
-    finals = np.concatenate([each.final for each in results])
-    tenths = np.transpose([np.quantile(each.scores, [0.1, 0.9]) for each in results])
-    thick = ", thick lines their 95% intervals" * findings.intervals
+    finals = np.concatenate([result.final for result in results])
+    # Of the scores, in which a seed that failed counts as the worst, as in the means.
+    tenths = np.transpose([np.quantile(result.scores, [0.1, 0.9]) for result in results])
+    intervals = ", thick lines their 95% intervals" if findings.intervals else ""
     yield charts.make_chart(
         findings,
         [_rows(findings), *charts.threshold_line(findings, "x", finals)],
@@ -27,7 +29,7 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         name="final",
         title="The final return",
         caption=(
-            f"Points are means over seeds{thick}, and pale bars the middle eight tenths of the "
+            f"Points are means over seeds{intervals}, and pale bars the middle eight tenths of the "
             "seeds."
         ),
         alt=(
@@ -47,17 +49,20 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
 
 
 def _rows(findings: Findings) -> charts.Spec:
-    said = {
+    """Returns a row of each configuration: bar, interval, point, and its label above them."""
+    titles = {
         "value": "mean over seeds",
         "low": "95% from",
         "high": "to",
         "tenth": "a tenth of the seeds below",
         "ninetieth": "a tenth above",
     }
-    tips = charts.tooltip(**{field: (name, ",.4~g") for field, name in said.items()})
+    tips = charts.tooltip(**{field: (title, ",.4~g") for field, title in titles.items()})
+    # The labels stand in the rows, so there is neither a legend nor an axis of names.
     color = charts.series(findings.labels, legend=False)
     scale = {"zero": False, "padding": 12, "nice": False}
     mean = charts.quantity("value", title="final return", scale=scale)
+    # From high to low: the best, at 0, is on top, with room for its label.
     y = {"axis": None, "scale": {"domain": [len(findings.results) - 0.4, -0.6]}}
     tenths = {"x": charts.quantity("tenth"), "x2": {"field": "ninetieth"}}
     interval = {"x": charts.quantity("low"), "x2": {"field": "high"}}

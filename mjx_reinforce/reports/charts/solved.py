@@ -14,10 +14,10 @@ from mjx_reinforce.statistics.survival import kaplan_meier
 
 def draw(findings: Findings) -> Iterator[charts.Chart]:
     """Yields the chart; none where no seed solved the task."""
-    if not any(each.solving and each.solving.ever for each in findings.results):
+    if not any(result.solving and result.solving.ever for result in findings.results):
         return
     shares = _shares(findings)
-    band = ", with its pointwise 95% interval" * charts.has_width(shares)
+    interval = ", with its pointwise 95% interval" if charts.has_width(shares) else ""
     yield charts.make_chart(
         findings,
         [_bands_and_lines(findings), charts.moment_line(findings)],
@@ -26,7 +26,7 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         title="How many have solved it",
         caption=(
             f"The share of seeds that have reached {number(findings.experiment.threshold or 0.0)} "
-            f"at least once, after Kaplan and Meier{band}. A seed that fell back later still "
+            f"at least once, after Kaplan and Meier{interval}. A seed that fell back later still "
             "counts here; table 1 says how many did. The curve's last point is the end of each "
             "seed's training."
         ),
@@ -37,6 +37,7 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
 
 
 def _bands_and_lines(findings: Findings) -> charts.Spec:
+    """Returns the shares as stairs: they rise where a seed solves the task, not between."""
     title = "seeds that have solved the task"
     tips = charts.tooltip(
         env_steps=("env steps", ",.0f"),
@@ -63,14 +64,19 @@ def _shares(findings: Findings) -> Table:
     who ever did.
     """
 
-    def part(place: int, result: Result) -> dict[str, Any]:
+    def share_rows(place: int, result: Result) -> dict[str, Any]:
+        """Returns the share of one configuration and its interval, on the grid up to its end."""
         steps = findings.grid[findings.grid <= result.configuration.env_steps[-1].min()]
         assert result.solving is not None
         curve = kaplan_meier(np.minimum(result.solving.steps, steps[-1]), result.solving.solved)
-        at = np.searchsorted(curve.steps, steps, side="right")
-        # Kaplan and Meier's is the share that has not.
-        left = {"share": curve.probability, "low": curve.high, "high": curve.low}
-        shares = {n: short(1 - np.concatenate([[1.0], x])[at], 4) for n, x in left.items()}
+        # How many of the curve's steps lie at or before each point of the grid: 0 is its start.
+        index = np.searchsorted(curve.steps, steps, side="right")
+        # Kaplan and Meier's is the share that has not, so that the ends change places.
+        unsolved = {"share": curve.probability, "low": curve.high, "high": curve.low}
+        shares = {
+            name: short(1 - np.concatenate([[1.0], share])[index], 4)
+            for name, share in unsolved.items()
+        }
         return {"configuration": place, "env_steps": short(steps, 7), **shares}
 
-    return stacked(part(place, result) for place, result in enumerate(findings.results))
+    return stacked(share_rows(place, result) for place, result in enumerate(findings.results))
