@@ -62,20 +62,26 @@ class Division:
           out_specs: the same of its result.
           by_episodes: whether it divides episodes itself.
         """
+        # On one device nothing is divided, and a program needs no shardings.
         if self.count == 1:
             return jax.jit(function)
         devices = self.devices()
+        # Each device computes its own seeds, and none waits for another.
         if self.seeds > 1:
             return devices.jit(function, in_specs, out_specs)
-        everywhere = devices.shardings(NONE)
+        # All devices get all seeds. A function that divides episodes maps that alone over them;
+        # XLA divides what follows from the episodes.
+        replicated = devices.shardings(NONE)
         if by_episodes:
-            shardings = {"in_shardings": everywhere, "out_shardings": everywhere}
+            shardings = {"in_shardings": replicated, "out_shardings": replicated}
             return jax.jit(function, **shardings)
         return devices.jit(function, NONE, NONE)
 
     def shapes(self, tree: PyTree, spec: PartitionSpec) -> Any:
         """Returns the shapes of arrays as ``put`` places them."""
-        return tree if self.count == 1 else self.devices().shapes(tree, self._spec(spec))
+        if self.count == 1:
+            return tree
+        return self.devices().shapes(tree, self._spec(spec))
 
     def put(self, tree: PyTree, spec: PartitionSpec = RUNS) -> Any:
         """Returns arrays for a function of ``jit``.
@@ -84,7 +90,9 @@ class Division:
           tree: arrays.
           spec: RUNS where their first axis is that of the seeds, NONE where none is.
         """
-        return tree if self.count == 1 else self.devices().put(tree, self._spec(spec))
+        if self.count == 1:
+            return tree
+        return self.devices().put(tree, self._spec(spec))
 
     def _spec(self, spec: PartitionSpec) -> PartitionSpec:
         return spec if self.seeds > 1 else NONE

@@ -83,9 +83,9 @@ class Observer(Generic[Seen]):
 _SECONDS = 0.25
 
 
-def check_layout(found: Checkpoint, slots: Slots) -> None:
+def check_layout(checkpoint: Checkpoint, slots: Slots) -> None:
     """Raises ValueError for a checkpoint of another program."""
-    if found.layout != slots.layout.layout:
+    if checkpoint.layout != slots.layout.layout:
         raise ValueError(
             "the states in the checkpoint do not fit this version of the program; resume with "
             "the version that wrote it"
@@ -108,7 +108,7 @@ class Runs(NamedTuple):
 
 
 class Training:
-    """Runs as they go on, such as a part of a sweep's.
+    """Runs as they go on, such as a chunk of a sweep's.
 
     config: the settings; one of those that differ from run to run stands for any value
     slots: what moves the runs
@@ -127,22 +127,29 @@ class Training:
         observers: Sequence[Observer[Any]] = (),
     ):
         """Begins before the first update, where the slots are."""
-        self.config, self.slots, self.record, self.runs = config, slots, record, runs
-        self.observers, self.ended = list(observers), False
+        self.config = config
+        self.slots = slots
+        self.record = record
+        self.runs = runs
+        self.observers = list(observers)
+        self.ended = False
         self._began = time.perf_counter()
         #: Wall time at which the present policies were there (s).
         self._reached = 0.0
 
-    def restore(self, found: Checkpoint) -> None:
+    def restore(self, checkpoint: Checkpoint) -> None:
         """Goes back to a checkpoint, or raises ValueError if it is another program's."""
-        check_layout(found, self.slots)
-        self.slots.restore(found.states)
-        self.record.restore(found.record)
-        self._began, self._reached = time.perf_counter() - found.seconds, found.seconds
+        check_layout(checkpoint, self.slots)
+        self.slots.restore(checkpoint.states)
+        self.record.restore(checkpoint.record)
+        # As if the run had not stopped: its clock goes on from the time in the checkpoint.
+        self._began = time.perf_counter() - checkpoint.seconds
+        self._reached = checkpoint.seconds
 
     def checkpoint(self) -> Checkpoint:
         """Returns what ``restore`` takes."""
         config = self.config
+        # Best policies and metrics.csv are a run's, which fills them in; a sweep has neither.
         return Checkpoint(
             layout=self.slots.layout.layout,
             states=self.slots.rows(),
@@ -172,20 +179,25 @@ class Training:
         Args:
           interrupted: whether the runs are to end soon.
         """
-        blocks, most = 1, self._most()
+        num_blocks = 1
+        max_blocks = self._max_blocks()
         while not (self.ended or interrupted()):
             look = not self.record.is_evaluated()
             if self.record.over():
+                # No updates follow with which the last policies could be evaluated.
                 if look:
                     self._take([self.slots.evaluate()])
                 break
-            began = time.perf_counter()
-            measured = self.slots.advance(*self.record.moved(), look=look, most=blocks)
-            enough = len(measured) * _SECONDS / (time.perf_counter() - began)
-            blocks = max(1, min(int(enough), 2 * len(measured), most))
-            self._take(measured)
+            start = time.perf_counter()
+            active, lengths = self.record.moved()
+            blocks = self.slots.advance(active, lengths, look=look, most=num_blocks)
+            # As many blocks at once as take ``_SECONDS`` at this speed. At most twice as many as
+            # now: while a policy learns, episodes may become longer.
+            timely = len(blocks) * _SECONDS / (time.perf_counter() - start)
+            num_blocks = max(1, min(int(timely), 2 * len(blocks), max_blocks))
+            self._take(blocks)
 
-    def _most(self) -> int:
+    def _max_blocks(self) -> int:
         """Returns how many blocks of updates may be made before anyone looks."""
         return (self.config.checkpoint_every or MAX_COUNT) // self.config.eval_every
 
@@ -193,10 +205,12 @@ class Training:
         """Takes in evaluations and the updates that followed them."""
         met = np.zeros(0, int)
         for block in blocks:
+            # The evaluation is of the policies before the block, so it is recorded before.
             if block.looked:
                 self._take_evaluation(block)
             if block.metrics:
                 met = self.record.add_updates(block)
+        # All blocks came at once: observers see the last one alone.
         if blocks[0].metrics:
             self._reached = self.seconds()
             for observer in self.observers:
@@ -217,16 +231,26 @@ class Driver(Training):
 
     record: RunRecord
 
-    def __init__(self, *given: Any):
+    def __init__(
+        self,
+        config: Config,
+        slots: Slots,
+        record: RunRecord,
+        runs: Runs,
+        observers: Sequence[Observer[Any]] = (),
+    ):
         """Begins before the first update, where the slots are."""
-        super().__init__(*given)
-        self.states = self._before = self.slots.states()
+        super().__init__(config, slots, record, runs, observers)
+        self.states = self.slots.states()
+        #: The states before the last block; its evaluation is of these.
+        self._before = self.states
         self.best = first_best(self.states.train_states)
 
-    def restore(self, found: Checkpoint) -> None:
+    def restore(self, checkpoint: Checkpoint) -> None:
         """Goes back to a checkpoint, which has the best policies too."""
-        super().restore(found)
-        self.states, self.best = self.slots.states(), StateRows(self.best).states(found.best)
+        super().restore(checkpoint)
+        self.states = self.slots.states()
+        self.best = StateRows(self.best).states(checkpoint.best)
 
     def checkpoint(self) -> Checkpoint:
         """Returns what ``restore`` takes."""
@@ -240,20 +264,25 @@ class Driver(Training):
         if not self.record.begun():
             self._take([self.slots.evaluate()])
         super().drive(interrupted)
+        # An observer that ends a run leaves the last block of updates without its evaluation.
         if self.ended and not self.record.is_evaluated():
             self._take([self.slots.evaluate()])
 
-    def _most(self) -> int:
+    def _max_blocks(self) -> int:
+        """Returns 1: ``_take`` has the states before one block and after it, none between."""
         return 1
 
     def _take(self, blocks: list[Measured]) -> None:
-        self._before, self.states = self.states, self.slots.states()
+        self._before = self.states
+        self.states = self.slots.states()
         super()._take(blocks)
 
     def _take_evaluation(self, measured: Measured) -> None:
         """Takes in what the policies before a block return, and keeps the best."""
-        before, looked = self._before.train_states, measured.looked
-        actor, num_updates = before.actor, before.num_updates
+        looked = measured.looked
+        # The evaluation rode with the block, and is of the policies that the block began with.
+        actor = self._before.train_states.actor
+        num_updates = self._before.train_states.num_updates
         present = Best(actor=actor, eval_return=looked["eval_return"], num_updates=num_updates)
         self.best = keep_best(self.best, present)
         rows = self.record.add_evaluation(measured, self._reached)
@@ -281,11 +310,12 @@ class Driver(Training):
         """
         returns = {}
         for name, actor in (("final", self.states.train_states.actor), ("best", self.best.actor)):
+            # Half a test is none: summary.json has both returns or neither.
             if interrupted():
                 return {}
-            result = self.slots.test(actor)
-            self.record.add_test(result)
-            returns[f"{name}_test_returns"] = result["eval_return"].tolist()
+            evaluation = self.slots.test(actor)
+            self.record.add_test(evaluation)
+            returns[f"{name}_test_returns"] = evaluation["eval_return"].tolist()
         return returns
 
     def summary(self, engine: str, compile_seconds: float, test: dict[str, Any]) -> dict[str, Any]:
@@ -296,6 +326,8 @@ class Driver(Training):
           compile_seconds: wall time of compiling.
           test: from ``test``, empty if the run was interrupted.
         """
+        # A run that was interrupted goes on when it is resumed, also one without hope: there it
+        # is tested and stopped.
         status = {"status": "finished" if test else "interrupted"}
         if test and self.record.hopeless():
             status = {"status": "stopped", "reason": HOPELESS}
@@ -312,7 +344,7 @@ def begin_run(
     threshold: float | None,
     slots: Slots,
     runs: Runs,
-    found: Checkpoint | None = None,
+    checkpoint: Checkpoint | None = None,
     actors: Actor | None = None,
     say: Callable[[str], None] = lambda text: None,
     observers: Sequence[Observer[Any]] = (),
@@ -325,22 +357,25 @@ def begin_run(
       threshold: the return that counts as solved, if any.
       slots: its seeds.
       runs: the same, by their numbers.
-      found: the checkpoint from which it goes on, if any; an observer takes it back there.
+      checkpoint: from which it goes on, if any; an observer takes it back there.
       actors: [S, ...] with which it begins, if not with its own.
       say: shows a line to the user.
       observers: who sees it.
       interrupted: whether it is to end soon.
     """
-    if found is not None:
-        check_layout(found, slots)  # before a file is touched
+    if checkpoint is not None:
+        check_layout(checkpoint, slots)  # before a file is touched
     if actors is not None:
         slots.restore(begin_with(slots.states(), actors))
     if config.minutes is not None:
-        first = slots.rows()
-        if found is not None:
-            slots.restore(found.states)
+        # From here on the budget is in env steps, so that a run that is resumed, or repeated with
+        # its config.json, ends where this one does. The speed is that of the states from which it
+        # goes on; what is trained to measure it is undone.
+        first_rows = slots.rows()
+        if checkpoint is not None:
+            slots.restore(checkpoint.states)
         env_steps = env_steps_in(60 * config.minutes, slots, config, interrupted)
-        slots.restore(first)
+        slots.restore(first_rows)
         say(f"{config.minutes:g} min are about {env_steps:,} env steps per seed here")
         config = dataclasses.replace(config, env_steps=env_steps, minutes=None)
     slots.budget = Budget.of(config.env_steps, config.max_updates)

@@ -66,17 +66,18 @@ def block_of_updates(
     """
 
     def active(state: RunState, budget: Budget) -> jax.Array:
-        used = counts.reached(state.train_states.env_steps, budget.env_steps)
-        return ~(used | counts.reached(state.train_states.num_updates, budget.updates))
+        """Returns which runs [R] have not used their budget."""
+        out_of_steps = counts.reached(state.train_states.env_steps, budget.env_steps)
+        return ~(out_of_steps | counts.reached(state.train_states.num_updates, budget.updates))
 
     def progress(state: RunState, budget: Budget) -> jax.Array:
         """Returns the share [R] of its budget that each run has used."""
         env_steps = counts.as_float(state.train_states.env_steps)
         updates = counts.as_float(state.train_states.num_updates)
-        # No run goes on whose budget is nothing.
-        limits = (counts.as_float(x) for x in budget)
-        one, other = (jnp.maximum(limit, 1.0) for limit in limits)
-        return jnp.minimum(jnp.maximum(env_steps / one, updates / other), 1.0)
+        # A budget of 0 would divide by 0. No run with such a budget goes on, so any share will do.
+        max_env_steps = jnp.maximum(counts.as_float(budget.env_steps), 1.0)
+        max_updates = jnp.maximum(counts.as_float(budget.updates), 1.0)
+        return jnp.minimum(jnp.maximum(env_steps / max_env_steps, updates / max_updates), 1.0)
 
     def step(
         state: TrainState,
@@ -85,32 +86,52 @@ def block_of_updates(
         eval_key: jax.Array,
         look: jax.Array,
     ) -> Any:
-        evaluation = None if visit is None else visit(eval_key, active=look)
-        state, metrics, played = step_with(build_learner(settings), state, going, evaluation)
-        looked = {} if evaluation is None or played is None else measure(played, evaluation)
+        """Makes one update of one run, and evaluates the policy before it.
+
+        Returns its state, its metrics, and what the evaluation measured; nothing without one.
+        """
+        evaluation = None
+        if visit is not None:
+            evaluation = visit(eval_key, active=look)
+        state, metrics, trajectory = step_with(build_learner(settings), state, going, evaluation)
+        looked = {}
+        # Without a shared launch there are no episodes of the evaluation.
+        if evaluation is not None and trajectory is not None:
+            looked = measure(trajectory, evaluation)
         return state, metrics | {"active": going}, looked
 
     @functools.partial(jax.jit, inline=True)  # traced once, for its shapes and for the loop
     def update(state: RunState, budget: Budget, look: jax.Array) -> Any:
+        """Makes one update of all runs [R] that have budget left; results as of ``step``."""
+        # Schedules such as that of the learning rate go by the share, which only we know.
         before = dataclasses.replace(state.train_states, progress=progress(state, budget))
-        going, looks = active(state, budget), jnp.broadcast_to(look, len(state.eval_keys))
+        going = active(state, budget)
+        looks = jnp.broadcast_to(look, len(state.eval_keys))
         train_states, metrics, looked = jax.vmap(step)(
             before, state.settings, going, state.eval_keys, looks
         )
         return dataclasses.replace(state, train_states=train_states), metrics, looked
 
     def advance(state: RunState, budget: Budget, look: jax.Array) -> tuple[RunState, Block]:
+        """Makes the updates, and evaluates before the first; see ``block_of_updates``."""
+
         def unfinished(carry: tuple[RunState, Block]) -> jax.Array:
             state, block = carry
             return (block.made < length) & jnp.any(active(state, budget))
 
         def body(carry: tuple[RunState, Block]) -> tuple[RunState, Block]:
-            state, (made, rows, looked) = carry
-            state, row, now = update(state, budget, look & (made == 0))
-            write = functools.partial(lax.dynamic_update_index_in_dim, index=made, axis=0)
-            looked = jax.tree.map(lambda x, old: jnp.where(made == 0, x, old), now, looked)
-            return state, Block(made + 1, jax.tree.map(write, rows, row), looked)
+            """Makes one update, and writes its metrics as a row."""
+            state, (num_updates, rows, looked) = carry
+            state, row, measured = update(state, budget, look & (num_updates == 0))
+            write = functools.partial(lax.dynamic_update_index_in_dim, index=num_updates, axis=0)
+            # The first update alone evaluates; what the others return as measured is void.
+            looked = jax.tree.map(
+                lambda x, old: jnp.where(num_updates == 0, x, old), measured, looked
+            )
+            return state, Block(num_updates + 1, jax.tree.map(write, rows, row), looked)
 
+        # The loop writes into arrays of a fixed length: XLA knows no others. Rows after the last
+        # update stay zero, so that "active" is False there.
         _, row, looked = jax.eval_shape(update, state, budget, look)
         zeros = functools.partial(jax.tree.map, lambda x: jnp.zeros(x.shape, x.dtype))
         rows = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), row)
@@ -164,8 +185,8 @@ def evaluate(
       >>> env = mr.envs.make("CartPole-v1")
       >>> learner = mr.reinforce(env, num_episodes=4, horizon=20)
       >>> actor = learner.init(jax.random.key(0)).actor
-      >>> found = mr.evaluate(env, learner, actor, jax.random.key(1), num_episodes=4, horizon=20)
-      >>> 1 <= found["eval_return"].item() <= 20
+      >>> metrics = mr.evaluate(env, learner, actor, jax.random.key(1), num_episodes=4, horizon=20)
+      >>> 1 <= metrics["eval_return"].item() <= 20
       True
     """
     evaluation = evaluation_episodes(key, num_episodes=num_episodes, active=active, sampled=sampled)
@@ -192,11 +213,14 @@ def measure(trajectory: Trajectory, evaluation: EvaluationEpisodes) -> dict[str,
     none where they rode with others. A return is NaN if one of its episodes left the finite
     numbers: what that earned until then says nothing.
     """
-    returns, lengths = episode_returns(trajectory), episode_lengths(trajectory)
+    returns = episode_returns(trajectory)
+    lengths = episode_lengths(trajectory)
+    # A return that overflowed says nothing, either.
     returns = jnp.where(trajectory.nonfinite | ~jnp.isfinite(returns), jnp.nan, returns)
     modes = evaluation.num_modes
-    sampled = len(evaluation.keys) > modes
-    stochastic = {"eval_return_stochastic": jnp.mean(returns[modes:])} if sampled else {}
+    stochastic = {}
+    if len(evaluation.keys) > modes:
+        stochastic["eval_return_stochastic"] = jnp.mean(returns[modes:])
     return stochastic | {
         "eval_return": jnp.mean(returns[:modes]),
         "eval_length": jnp.mean(lengths[:modes]),
@@ -258,16 +282,18 @@ def programs_of(
       division: among which devices the runs are divided.
     """
     learner = build_learner({})  # policies and engines are those of any
+    # A launch has one horizon, and an evaluation plays to that of the environment.
     rides = isinstance(learner.play, SharedLaunch) and config.training_horizon(horizon) == horizon
 
-    def first(key: jax.Array, settings: dict[str, jax.Array]) -> TrainState:
+    def first_state(key: jax.Array, settings: dict[str, jax.Array]) -> TrainState:
         return build_learner(settings).init(key)
 
     # One program, whatever the seeds are: a program for each operation on keys takes longer.
     def states(seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]) -> RunState:
+        """Returns the states of R runs before their first update."""
         keys = seed_keys(seed, numbers)
         return RunState(
-            train_states=jax.vmap(first)(keys, settings),
+            train_states=jax.vmap(first_state)(keys, settings),
             eval_keys=eval_keys(numbers),
             settings=settings,
         )
@@ -280,25 +306,30 @@ def programs_of(
     visit = functools.partial(evaluation_episodes, **size)
     play = functools.partial(evaluate, env, learner, horizon=horizon, **size)
 
-    def look_at(rows: jax.Array, which: jax.Array) -> dict[str, jax.Array]:
-        now = layout.traced_states(rows)
-        return jax.vmap(play)(now.train_states.actor, now.eval_keys, active=which)
+    def look_at(rows: jax.Array, chosen: jax.Array) -> dict[str, jax.Array]:
+        state = layout.traced_states(rows)
+        return jax.vmap(play)(state.train_states.actor, state.eval_keys, active=chosen)
 
     updates = block_of_updates(build_learner, config.block_length, visit if rides else None)
 
     def advance(
-        rows: jax.Array, budget: Sequence[jax.Array], which: jax.Array, look: jax.Array
+        rows: jax.Array, budget: Sequence[jax.Array], occupied: jax.Array, look: jax.Array
     ) -> Any:
+        """Makes a block of updates of rows; those without a run are not ``occupied`` [R]."""
         before = layout.traced_states(rows)
-        # A row without a run has no budget.
-        played = before.train_states.env_steps
-        played = jnp.where(which[:, None], played, counts.from_int(MAX_COUNT))
-        train_states = dataclasses.replace(before.train_states, env_steps=played)
+        # A row without a run counts as one whose budget is used: it stands still, and the block
+        # ends without waiting for it.
+        env_steps = before.train_states.env_steps
+        env_steps = jnp.where(occupied[:, None], env_steps, counts.from_int(MAX_COUNT))
+        train_states = dataclasses.replace(before.train_states, env_steps=env_steps)
         before = dataclasses.replace(before, train_states=train_states)
-        after, (_, metrics, looked) = updates(before, Budget(*budget), which & look)
-        measured = metrics if whole else {name: metrics[name] for name in _COUNTED}
-        return layout.traced_rows(after), measured, looked
+        after, (_, metrics, looked) = updates(before, Budget(*budget), occupied & look)
+        # A sweep records no more, and what is returned is fetched of each of its runs.
+        if not whole:
+            metrics = {name: metrics[name] for name in _COUNTED}
+        return layout.traced_rows(after), metrics, looked
 
+    # The functions above read ``layout`` when they are traced, which is later.
     numbers = jax.ShapeDtypeStruct((num_runs,), np.uint32)
     settings = {name: jax.ShapeDtypeStruct((num_runs,), jnp.result_type(float)) for name in traced}
     like = jax.eval_shape(states, np.uint32(0), numbers, settings)
