@@ -81,9 +81,8 @@ def get_ready(
     if key is not None:
         ready = _read_of_settings(key, config, division)
     if ready is None:
-        if env is None:
-            env = envs.make_set(config.env, config.env_set)
-        ready = made(env, config, division, traced)
+        task = envs.make_set(config.env, config.env_set) if env is None else env
+        ready = made(task, config, division, traced)
         if key is not None:
             ready = keep(key, ready)
     if config.resume is None and config.policy == "auto":
