@@ -12,7 +12,7 @@ from mjx_reinforce.runs.display import Display, SweepScreen
 from mjx_reinforce.runs.plan import Part, Prepared
 from mjx_reinforce.runs.saving import Files
 from mjx_reinforce.setup.compile_times import keep_seconds
-from mjx_reinforce.training.driver import Driver, Observer, Runs, Training, begin_run
+from mjx_reinforce.training.driver import Driver, Observer, RunDriver, Runs, begin_run
 from mjx_reinforce.training.record import Record
 from mjx_reinforce.training.slots import Compiled, Slots, Stopwatch, compile_slots, started
 
@@ -23,7 +23,7 @@ def conduct(
     display: Display,
     observers: Sequence[Observer[Any]],
     interrupt: Interrupt,
-) -> tuple[Training | None, dict[str, Any]]:
+) -> tuple[Driver | None, dict[str, Any]]:
     """Trains the chunks that have not ended yet, to their end or until they are interrupted.
 
     Args:
@@ -67,7 +67,7 @@ def conduct(
             given = config, part.ready.threshold, slots, runs, prepared.found, prepared.actors
             driver = begin_run(*given, display.say, everyone, interrupt.heard)
         else:
-            driver = Training(config, slots, Record(config), runs, everyone)
+            driver = Driver(config, slots, Record(config), runs, everyone)
         for observer in everyone:
             observer.began(driver)
         driver.drive(interrupt.heard)
@@ -75,7 +75,7 @@ def conduct(
             observer.ended(driver)
         if not driver.record.done():
             break
-    if isinstance(driver, Driver):
+    if isinstance(driver, RunDriver):
         # A signal after that changes nothing: what is left takes a second or two.
         test, engine = driver.test(interrupt.heard), prepared.parts[0].ready.engine
         summary = driver.summary(engine, clock.compiling, test)

@@ -21,7 +21,7 @@ from mjx_reinforce.reports.experiment import counted, say, setting_in_words
 from mjx_reinforce.runs.plan import Part, Prepared
 from mjx_reinforce.statistics import enough, iqm
 from mjx_reinforce.training import record
-from mjx_reinforce.training.driver import Driver, Evaluation, Observer, Training
+from mjx_reinforce.training.driver import Driver, Evaluation, Observer, RunDriver
 
 
 class _Bar(Progress):
@@ -44,7 +44,7 @@ class _Screen(Console):
         self.quiet = True
 
 
-class Display(Observer[Driver]):
+class Display(Observer[RunDriver]):
     """A progress bar on a terminal, one line an evaluation elsewhere."""
 
     def __init__(self, *, quiet: bool = False):
@@ -144,19 +144,19 @@ class Display(Observer[Driver]):
                 f"{_returns_and_speed(now)}  {done}  {left}".rstrip()
             )
 
-    def updated(self, driver: Driver, met: np.ndarray) -> None:
+    def updated(self, driver: RunDriver, met: np.ndarray) -> None:
         """Says once which seeds met numbers that are not finite; the last table counts them."""
         if met.any() and not self._told:
             self._told = True
             said = record.describe_nonfinite(met, driver.config.first_seed, driver.updates())
             self.say(said, "yellow")
 
-    def evaluated(self, driver: Driver, evaluation: Evaluation, rows: Arrays) -> None:
+    def evaluated(self, driver: RunDriver, evaluation: Evaluation, rows: Arrays) -> None:
         """Shows how far the run is and how well it does."""
         self.show_progress(driver.record.progress())
 
 
-class SweepScreen(Observer[Training]):
+class SweepScreen(Observer[Driver]):
     """Shows how far a sweep is, and which of its runs are trained."""
 
     def __init__(self, display: Display, prepared: Prepared, parts: Iterable[Part]):
@@ -166,7 +166,7 @@ class SweepScreen(Observer[Training]):
         self._done, self._brought = 0, 0.0
         self._total = sum(len(runs.seed) for part in parts for runs in part.chunks)
 
-    def began(self, driver: Training) -> None:
+    def began(self, driver: Driver) -> None:
         """Says which configurations the lines that follow are of."""
         self._brought += driver.record.used_up()
         runs, every = driver.runs, self._prepared.design.configurations
@@ -177,7 +177,7 @@ class SweepScreen(Observer[Training]):
         said = (f"{setting_in_words(name)} {', '.join(x)}" for name, x in few.items())
         self._display.say(f"{'; '.join(said)} ({count}, {counted(len(runs.seed), 'run')})")
 
-    def updated(self, driver: Training, met: np.ndarray) -> None:
+    def updated(self, driver: Driver, met: np.ndarray) -> None:
         """Shows how far it is."""
         done = self._done + driver.record.used_up()
         fraction, gained = float(done / self._total), float(done - self._brought) / self._total
@@ -185,7 +185,7 @@ class SweepScreen(Observer[Training]):
         now = driver.record.measure(fraction, driver.seconds(), gained, running)
         self._display.show_progress(now)
 
-    def ended(self, driver: Training) -> None:
+    def ended(self, driver: Driver) -> None:
         """Counts the runs."""
         self._done += len(driver.runs.seed)
 

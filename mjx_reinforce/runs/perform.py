@@ -28,7 +28,7 @@ from mjx_reinforce.training.resume import read_record
 
 if TYPE_CHECKING:
     from mjx_reinforce.runs.display import Display
-    from mjx_reinforce.training.driver import Observer, Training
+    from mjx_reinforce.training.driver import Driver, Observer
 
 #: What a kill leaves of the first file of a run or a sweep, which then was not begun.
 _FIRST = (".config.json.", ".sweep.json.")
@@ -160,7 +160,7 @@ class Outcome(NamedTuple):
 
     directory: Path | None
     summary: dict[str, Any]
-    driver: "Training | None"
+    driver: "Driver | None"
     policy: dict[str, Any]
     display: "Display"
 

@@ -50,31 +50,31 @@ class Evaluation(NamedTuple):
     train_states: TrainState
 
 
-#: The runs that an observer sees.
-Seen = TypeVar("Seen", bound="Training")
+#: What an observer sees: any runs, or a run by itself.
+DriverT = TypeVar("DriverT", bound="Driver")
 
 
-class Observer(Generic[Seen]):
+class Observer(Generic[DriverT]):
     """Sees runs go on, and changes nothing of them; what a subclass leaves out does nothing."""
 
-    def began(self, driver: Seen) -> None:
+    def began(self, driver: DriverT) -> None:
         """Called before the first update, also of runs that go on."""
 
-    def updated(self, driver: Seen, met: np.ndarray) -> None:
+    def updated(self, driver: DriverT, met: np.ndarray) -> None:
         """Called after each block of updates.
 
         Args:
-          driver: of the runs.
+          driver: of the runs, after the block.
           met: [S] how many of the last block met numbers which are not finite, of each seed.
         """
 
-    def evaluated(self, driver: Seen, evaluation: Evaluation, rows: Arrays) -> None:
+    def evaluated(self, driver: DriverT, evaluation: Evaluation, rows: Arrays) -> None:
         """Called after each evaluation, with what it measured and its rows in metrics.csv."""
 
-    def ended(self, driver: Seen) -> None:
+    def ended(self, driver: DriverT) -> None:
         """Called after the last block of updates and its evaluation, before the last test."""
 
-    def finished(self, driver: Seen, summary: dict[str, Any]) -> None:
+    def finished(self, driver: DriverT, summary: dict[str, Any]) -> None:
         """Called after the last test, with the contents of summary.json, or of sweep.json."""
 
 
@@ -107,8 +107,8 @@ class Runs(NamedTuple):
     seed: np.ndarray
 
 
-class Training:
-    """Runs as they go on, such as a chunk of a sweep's.
+class Driver:
+    """Trains runs, such as a chunk of a sweep's.
 
     config: the settings; one of those that differ from run to run stands for any value
     slots: what moves the runs
@@ -221,8 +221,8 @@ class Training:
         self.record.add_evaluation(measured, self._reached)
 
 
-class Driver(Training):
-    """The seeds of a run as they go on.
+class RunDriver(Driver):
+    """Trains the seeds of a run by itself, which has evaluations to show and best policies.
 
     config: the settings of the run, its horizon among them
     states: of training, on the host
@@ -349,7 +349,7 @@ def begin_run(
     say: Callable[[str], None] = lambda text: None,
     observers: Sequence[Observer[Any]] = (),
     interrupted: Callable[[], bool] = lambda: False,
-) -> Driver:
+) -> RunDriver:
     """Returns a run before its first update.
 
     Args:
@@ -379,7 +379,7 @@ def begin_run(
         say(f"{config.minutes:g} min are about {env_steps:,} env steps per seed here")
         config = dataclasses.replace(config, env_steps=env_steps, minutes=None)
     slots.budget = Budget.of(config.env_steps, config.max_updates)
-    return Driver(config, slots, RunRecord(config, threshold), runs, observers)
+    return RunDriver(config, slots, RunRecord(config, threshold), runs, observers)
 
 
 #: The part of the time in which its speed is measured; what is trained in it is trained again.

@@ -269,7 +269,7 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
     What ended is not trained again, and its report is written if it is not there.
     """
     monkeypatch.setattr(plan, "_CPU_EPISODES", 16)
-    drive, driven, ended, tried = driver.Training.drive, [], [], []
+    drive, driven, ended, tried = driver.Driver.drive, [], [], []
     add, save, write = SweepFiles._write_part, SweepFiles._save_checkpoint, resume.save
 
     def interrupted(*arguments):
@@ -294,7 +294,7 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
         write(*arguments, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(driver.Training, "drive", interrupted)
+        patch.setattr(driver.Driver, "drive", interrupted)
         assert run(f"{CHUNKS} --output parts") == 0
     assert json.loads(Path("parts/sweep.json").read_text())["status"] == "interrupted"
     for name, crash in (

@@ -6,7 +6,7 @@ import numpy as np
 
 from mjx_reinforce.learning import counts
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training.driver import Driver, Runs
+from mjx_reinforce.training.driver import RunDriver, Runs
 from mjx_reinforce.training.record import Measured, RunRecord
 from mjx_reinforce.training.state import Best, first_best, keep_best
 
@@ -77,7 +77,7 @@ class Diary:
 def driver_of(steps, *observers, config=CONFIG, threshold=None):
     record = RunRecord(config, threshold)
     record.add_test = lambda result: None
-    return Driver(config, steps, record, RUNS, observers)
+    return RunDriver(config, steps, record, RUNS, observers)
 
 
 def never():
