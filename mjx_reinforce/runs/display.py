@@ -182,7 +182,7 @@ class SweepScreen(Observer[Driver]):
         done = self._done + driver.record.used_up()
         fraction, gained = float(done / self._total), float(done - self._brought) / self._total
         running = self._prepared.clock.running()
-        now = driver.record.measure(fraction, driver.seconds(), gained, running)
+        now = driver.record.progress_at(fraction, driver.seconds(), gained, running)
         self._display.show_progress(now)
 
     def ended(self, driver: Driver) -> None:

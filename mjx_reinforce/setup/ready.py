@@ -216,7 +216,11 @@ def keep(key: str, ready: Ready) -> Ready:
     assert cache is not None  # there is a key
     # A state of the user's own classes is no error; it is not kept.
     try:
-        content = {"facts": facts, "like": describe_tree(like), "rides": programs.rides}
+        content = {
+            "facts": facts,
+            "like": describe_tree(like),
+            "advance_evaluates": programs.advance_evaluates,
+        }
     except TypeError:
         return ready
     cache.write(f"{key}-facts", json.dumps(content).encode())
@@ -227,10 +231,10 @@ def keep(key: str, ready: Ready) -> Ready:
     rows = jax.ShapeDtypeStruct((width, StateRows(like).size), np.uint8)
     budget = (jax.ShapeDtypeStruct((2,), np.uint32),) * len(Budget._fields)
     occupied = jax.ShapeDtypeStruct((width,), bool)
-    look = jax.ShapeDtypeStruct((), bool)
+    evaluation_due = jax.ShapeDtypeStruct((), bool)
     arguments = {
         "begin": (seed, numbers, {}),  # a run has no settings that are traced
-        "advance": (rows, budget, occupied, look),
+        "advance": (rows, budget, occupied, evaluation_due),
         "evaluate": (rows, occupied),
     }
     exported = {
@@ -255,7 +259,9 @@ def read_ready(key: str, division: Division = ALONE) -> Ready | None:
         return None
     content = json.loads(text)
     like = rebuild(content["like"])
-    programs = Programs(*loaded, rides=content["rides"], like=like, division=division)
+    programs = Programs(
+        *loaded, advance_evaluates=content["advance_evaluates"], like=like, division=division
+    )
     return Ready(**content["facts"], programs=lambda: programs)
 
 

@@ -182,15 +182,15 @@ class Driver:
         num_blocks = 1
         max_blocks = self._max_blocks()
         while not (self.ended or interrupted()):
-            look = not self.record.is_evaluated()
+            evaluate = not self.record.is_evaluated()
             if self.record.over():
                 # No updates follow with which the last policies could be evaluated.
-                if look:
+                if evaluate:
                     self._take([self.slots.evaluate()])
                 break
             start = time.perf_counter()
             active, lengths = self.record.moved()
-            blocks = self.slots.advance(active, lengths, look=look, most=num_blocks)
+            blocks = self.slots.advance(active, lengths, evaluate=evaluate, max_blocks=num_blocks)
             # As many blocks at once as take ``_SECONDS`` at this speed. At most twice as many as
             # now: while a policy learns, episodes may become longer.
             timely = len(blocks) * _SECONDS / (time.perf_counter() - start)
@@ -198,7 +198,7 @@ class Driver:
             self._take(blocks)
 
     def _max_blocks(self) -> int:
-        """Returns how many blocks of updates may be made before anyone looks."""
+        """Returns how many blocks of updates are made before the host sees any of them."""
         return (self.config.checkpoint_every or MAX_COUNT) // self.config.eval_every
 
     def _take(self, blocks: list[Measured]) -> None:
@@ -206,7 +206,7 @@ class Driver:
         met = np.zeros(0, int)
         for block in blocks:
             # The evaluation is of the policies before the block, so it is recorded before.
-            if block.looked:
+            if block.eval_metrics:
                 self._take_evaluation(block)
             if block.metrics:
                 met = self.record.add_updates(block)
@@ -279,18 +279,20 @@ class RunDriver(Driver):
 
     def _take_evaluation(self, measured: Measured) -> None:
         """Takes in what the policies before a block return, and keeps the best."""
-        looked = measured.looked
-        # The evaluation rode with the block, and is of the policies that the block began with.
+        eval_metrics = measured.eval_metrics
+        # It is of the policies with which the block began.
         actor = self._before.train_states.actor
         num_updates = self._before.train_states.num_updates
-        present = Best(actor=actor, eval_return=looked["eval_return"], num_updates=num_updates)
+        present = Best(
+            actor=actor, eval_return=eval_metrics["eval_return"], num_updates=num_updates
+        )
         self.best = keep_best(self.best, present)
         rows = self.record.add_evaluation(measured, self._reached)
         evaluation = Evaluation(
             updates=counts.to_int(num_updates),
             env_steps=self.record.env_steps.copy(),
             seconds=self._reached,
-            measured=looked,
+            measured=eval_metrics,
             actor=actor,
             train_states=self.states.train_states,
         )
@@ -313,9 +315,9 @@ class RunDriver(Driver):
             # Half a test is none: summary.json has both returns or neither.
             if interrupted():
                 return {}
-            evaluation = self.slots.test(actor)
-            self.record.add_test(evaluation)
-            returns[f"{name}_test_returns"] = evaluation["eval_return"].tolist()
+            eval_metrics = self.slots.test(actor)
+            self.record.count_steps(eval_metrics)
+            returns[f"{name}_test_returns"] = eval_metrics["eval_return"].tolist()
         return returns
 
     def summary(self, engine: str, compile_seconds: float, test: dict[str, Any]) -> dict[str, Any]:
@@ -405,7 +407,7 @@ def env_steps_in(
     began, past = time.perf_counter(), [(0.0, *_played(slots))]
     while past[-1][0] < _PART * seconds and not (past[1:] and interrupted()):
         slots.budget = Budget.of(None, min(past[-1][2] + 2 ** (len(past) - 1), most))
-        if not slots.advance(look=False):
+        if not slots.advance(evaluate=False):
             break  # no seed has an update left
         past.append((time.perf_counter() - began, *_played(slots)))
     if len(past) == 1:

@@ -39,19 +39,21 @@ BuildLearner = Callable[[dict[str, jax.Array]], Learner]
 class Block(NamedTuple):
     """What a block of updates measured.
 
-    made: [] how many updates were made
+    num_updates: [] how many were made
     metrics: [length, R] each; the rows after the last update are zero
-    looked: [R] each, what ``measure`` returns of the policies before the first update;
-      empty where the evaluation does not ride with it
+    eval_metrics: [R] each, what ``evaluation_metrics`` returns of the policies before the first
+      update; empty where ``advance`` does not evaluate
     """
 
-    made: jax.Array
+    num_updates: jax.Array
     metrics: dict[str, jax.Array]
-    looked: dict[str, jax.Array]
+    eval_metrics: dict[str, jax.Array]
 
 
 def block_of_updates(
-    build_learner: BuildLearner, length: int, visit: Callable[..., EvaluationEpisodes] | None
+    build_learner: BuildLearner,
+    length: int,
+    make_evaluation: Callable[..., EvaluationEpisodes] | None,
 ) -> Callable[..., tuple[RunState, Block]]:
     """Returns a function that makes ``length`` updates of all runs, or fewer if that is the end.
 
@@ -61,8 +63,8 @@ def block_of_updates(
     Args:
       build_learner: called while the settings of one run are traced.
       length: rows of the metrics.
-      visit: (key of an evaluation [], active=whether it is made []) -> its episodes, which are
-        played in one go with those of the first update; None where learners cannot.
+      make_evaluation: (key of an evaluation [], active=whether it is made []) -> its episodes,
+        which are played in one launch with those of the first update; None where learners cannot.
     """
 
     def active(state: RunState, budget: Budget) -> jax.Array:
@@ -84,58 +86,62 @@ def block_of_updates(
         settings: dict[str, jax.Array],
         going: jax.Array,
         eval_key: jax.Array,
-        look: jax.Array,
+        evaluation_due: jax.Array,
     ) -> Any:
         """Makes one update of one run, and evaluates the policy before it.
 
         Returns its state, its metrics, and what the evaluation measured; nothing without one.
         """
         evaluation = None
-        if visit is not None:
-            evaluation = visit(eval_key, active=look)
+        if make_evaluation is not None:
+            evaluation = make_evaluation(eval_key, active=evaluation_due)
         state, metrics, trajectory = step_with(build_learner(settings), state, going, evaluation)
-        looked = {}
+        eval_metrics = {}
         # Without a shared launch there are no episodes of the evaluation.
         if evaluation is not None and trajectory is not None:
-            looked = measure(trajectory, evaluation)
-        return state, metrics | {"active": going}, looked
+            eval_metrics = evaluation_metrics(trajectory, evaluation)
+        return state, metrics | {"active": going}, eval_metrics
 
     @functools.partial(jax.jit, inline=True)  # traced once, for its shapes and for the loop
-    def update(state: RunState, budget: Budget, look: jax.Array) -> Any:
+    def update(state: RunState, budget: Budget, evaluation_due: jax.Array) -> Any:
         """Makes one update of all runs [R] that have budget left; results as of ``step``."""
         # Schedules such as that of the learning rate go by the share, which only we know.
         before = dataclasses.replace(state.train_states, progress=progress(state, budget))
         going = active(state, budget)
-        looks = jnp.broadcast_to(look, len(state.eval_keys))
-        train_states, metrics, looked = jax.vmap(step)(
-            before, state.settings, going, state.eval_keys, looks
+        evaluation_due = jnp.broadcast_to(evaluation_due, len(state.eval_keys))
+        train_states, metrics, eval_metrics = jax.vmap(step)(
+            before, state.settings, going, state.eval_keys, evaluation_due
         )
-        return dataclasses.replace(state, train_states=train_states), metrics, looked
+        return dataclasses.replace(state, train_states=train_states), metrics, eval_metrics
 
-    def advance(state: RunState, budget: Budget, look: jax.Array) -> tuple[RunState, Block]:
+    def advance(
+        state: RunState, budget: Budget, evaluation_due: jax.Array
+    ) -> tuple[RunState, Block]:
         """Makes the updates, and evaluates before the first; see ``block_of_updates``."""
 
         def unfinished(carry: tuple[RunState, Block]) -> jax.Array:
             state, block = carry
-            return (block.made < length) & jnp.any(active(state, budget))
+            return (block.num_updates < length) & jnp.any(active(state, budget))
 
         def body(carry: tuple[RunState, Block]) -> tuple[RunState, Block]:
             """Makes one update, and writes its metrics as a row."""
-            state, (num_updates, rows, looked) = carry
-            state, row, measured = update(state, budget, look & (num_updates == 0))
+            state, (num_updates, rows, eval_metrics) = carry
+            state, row, measured = update(state, budget, evaluation_due & (num_updates == 0))
             write = functools.partial(lax.dynamic_update_index_in_dim, index=num_updates, axis=0)
             # The first update alone evaluates; what the others return as measured is void.
-            looked = jax.tree.map(
-                lambda x, old: jnp.where(num_updates == 0, x, old), measured, looked
+            eval_metrics = jax.tree.map(
+                lambda x, old: jnp.where(num_updates == 0, x, old), measured, eval_metrics
             )
-            return state, Block(num_updates + 1, jax.tree.map(write, rows, row), looked)
+            return state, Block(num_updates + 1, jax.tree.map(write, rows, row), eval_metrics)
 
         # The loop writes into arrays of a fixed length: XLA knows no others. Rows after the last
         # update stay zero, so that "active" is False there.
-        _, row, looked = jax.eval_shape(update, state, budget, look)
+        _, row, eval_metrics = jax.eval_shape(update, state, budget, evaluation_due)
         zeros = functools.partial(jax.tree.map, lambda x: jnp.zeros(x.shape, x.dtype))
         rows = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), row)
-        return lax.while_loop(unfinished, body, (state, Block(jnp.int32(0), rows, zeros(looked))))
+        return lax.while_loop(
+            unfinished, body, (state, Block(jnp.int32(0), rows, zeros(eval_metrics)))
+        )
 
     return advance
 
@@ -167,7 +173,7 @@ def evaluate(
     active: bool | jax.Array = True,
     sampled: bool = True,
 ) -> dict[str, jax.Array]:
-    """Plays the episodes of an evaluation alone; returns what ``measure`` does.
+    """Plays the episodes of an evaluation alone; returns what ``evaluation_metrics`` does.
 
     Args:
       env: what is played.
@@ -201,17 +207,19 @@ def evaluate(
         deterministic=evaluation.deterministic(),
         active=evaluation.active,
     )
-    return measure(trajectory, evaluation) | {"simulated_steps": trajectory.simulated}
+    return evaluation_metrics(trajectory, evaluation) | {"simulated_steps": trajectory.simulated}
 
 
-def measure(trajectory: Trajectory, evaluation: EvaluationEpisodes) -> dict[str, jax.Array]:
+def evaluation_metrics(
+    trajectory: Trajectory, evaluation: EvaluationEpisodes
+) -> dict[str, jax.Array]:
     """Returns what the episodes of an evaluation show.
 
     ``eval_return`` and ``eval_length`` [], means over the deterministic episodes,
     ``eval_return_stochastic`` [], over the sampled ones if there are any, ``eval_steps`` [], the
     steps of all episodes, and ``simulated_steps`` [], those that were simulated for them alone:
-    none where they rode with others. A return is NaN if one of its episodes left the finite
-    numbers: what that earned until then says nothing.
+    none where they shared the launch of others. A return is NaN if one of its episodes left the
+    finite numbers: what that earned until then says nothing.
     """
     returns = episode_returns(trajectory)
     lengths = episode_lengths(trajectory)
@@ -240,7 +248,7 @@ class Programs(NamedTuple):
     advance: (states, the parts of a ``Budget``, which rows have a run [R], whether to evaluate [])
       -> (states, metrics [K, R] each, what was evaluated [R] each), as in ``Block``
     evaluate: (states, whether to [R]) -> what ``evaluate`` returns, [R] each
-    rides: whether ``advance`` evaluates; else ``evaluate`` does, before it
+    advance_evaluates: whether ``advance`` evaluates; else ``evaluate`` does, before it
     like: the shapes of a ``RunState``
     division: among which devices the runs are divided; R are those of one device
     """
@@ -248,7 +256,7 @@ class Programs(NamedTuple):
     begin: Callable[..., tuple[jax.Array, jax.Array]]
     advance: Callable[..., tuple[jax.Array, dict[str, jax.Array], dict[str, jax.Array]]]
     evaluate: Callable[..., dict[str, jax.Array]]
-    rides: bool
+    advance_evaluates: bool
     like: RunState
     division: Division = ALONE
 
@@ -283,7 +291,9 @@ def programs_of(
     """
     learner = build_learner({})  # policies and engines are those of any
     # A launch has one horizon, and an evaluation plays to that of the environment.
-    rides = isinstance(learner.play, SharedLaunch) and config.training_horizon(horizon) == horizon
+    advance_evaluates = (
+        isinstance(learner.play, SharedLaunch) and config.training_horizon(horizon) == horizon
+    )
 
     def first_state(key: jax.Array, settings: dict[str, jax.Array]) -> TrainState:
         return build_learner(settings).init(key)
@@ -303,17 +313,19 @@ def programs_of(
         return rows, plain(last_test_keys(numbers, config))
 
     size: Any = {"num_episodes": config.eval_episodes, "sampled": whole}
-    visit = functools.partial(evaluation_episodes, **size)
+    make_evaluation = functools.partial(evaluation_episodes, **size)
     play = functools.partial(evaluate, env, learner, horizon=horizon, **size)
 
-    def look_at(rows: jax.Array, chosen: jax.Array) -> dict[str, jax.Array]:
+    def evaluate_rows(rows: jax.Array, chosen: jax.Array) -> dict[str, jax.Array]:
         state = layout.traced_states(rows)
         return jax.vmap(play)(state.train_states.actor, state.eval_keys, active=chosen)
 
-    updates = block_of_updates(build_learner, config.block_length, visit if rides else None)
+    updates = block_of_updates(
+        build_learner, config.block_length, make_evaluation if advance_evaluates else None
+    )
 
     def advance(
-        rows: jax.Array, budget: Sequence[jax.Array], occupied: jax.Array, look: jax.Array
+        rows: jax.Array, budget: Sequence[jax.Array], occupied: jax.Array, evaluation_due: jax.Array
     ) -> Any:
         """Makes a block of updates of rows; those without a run are not ``occupied`` [R]."""
         before = layout.traced_states(rows)
@@ -323,15 +335,17 @@ def programs_of(
         env_steps = jnp.where(occupied[:, None], env_steps, counts.from_int(MAX_COUNT))
         train_states = dataclasses.replace(before.train_states, env_steps=env_steps)
         before = dataclasses.replace(before, train_states=train_states)
-        after, (_, metrics, looked) = updates(before, Budget(*budget), occupied & look)
+        after, (_, metrics, eval_metrics) = updates(
+            before, Budget(*budget), occupied & evaluation_due
+        )
         # A sweep records no more, and what is returned is fetched of each of its runs.
         if not whole:
             metrics = {name: metrics[name] for name in _COUNTED}
-        return layout.traced_rows(after), metrics, looked
+        return layout.traced_rows(after), metrics, eval_metrics
 
     # The functions above read ``layout`` when they are traced, which is later.
     numbers = jax.ShapeDtypeStruct((num_runs,), np.uint32)
     settings = {name: jax.ShapeDtypeStruct((num_runs,), jnp.result_type(float)) for name in traced}
     like = jax.eval_shape(states, np.uint32(0), numbers, settings)
     layout = StateRows(like)
-    return Programs(begin, advance, look_at, rides, like, division)
+    return Programs(begin, advance, evaluate_rows, advance_evaluates, like, division)

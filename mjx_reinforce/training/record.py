@@ -21,12 +21,13 @@ class Measured(NamedTuple):
 
     runs: [n] their numbers, the least first
     metrics: [K, n] each, what ``block_of_updates`` measured in at most K updates; empty without any
-    looked: [n] each, what ``programs.evaluate`` returns of the policies before; empty without any
+    eval_metrics: [n] each, what ``programs.evaluate`` returns of the policies before; empty without
+      any
     """
 
     runs: np.ndarray
     metrics: Arrays
-    looked: Arrays
+    eval_metrics: Arrays
 
 
 COLUMNS = (
@@ -285,16 +286,16 @@ class Record:
         Returns:
           Its rows in metrics.csv, which a sweep has not.
         """
-        runs, metrics, looked = measured
+        runs, metrics, eval_metrics = measured
         # A run whose budget is used stands still. It is evaluated when all have ended, with no
         # block; until then it keeps its last evaluation, so that its rows depend on no other run.
         active = np.ones(len(runs), bool)
         if metrics:
             active = np.any(metrics["active"], axis=0)
         runs = runs[active]
-        self.returns[runs] = looked["eval_return"][active]
+        self.returns[runs] = eval_metrics["eval_return"][active]
         self.seen[runs] = self.env_steps[runs]
-        self.lengths[runs] = looked["eval_steps"][active]
+        self.lengths[runs] = eval_metrics["eval_steps"][active]
         self._append(eval_return=self.returns, env_steps=self.seen)
         return {}
 
@@ -317,7 +318,9 @@ class Record:
         """Returns which runs [R] have not used their budget, and how long their episodes are."""
         return self.used() < 1.0, self.lengths
 
-    def measure(self, fraction: float, seconds: float, gained: float, passed: float) -> Progress:
+    def progress_at(
+        self, fraction: float, seconds: float, gained: float, passed: float
+    ) -> Progress:
         """Returns how far the runs are.
 
         Args:
@@ -440,17 +443,17 @@ class RunRecord(Record):
         Returns:
           Its rows in metrics.csv.
         """
-        looked = measured.looked
+        eval_metrics = measured.eval_metrics
         counts = {"env_steps": self.env_steps, "episodes": self.episodes}
-        self._append(**looked, **counts, updates=self.updates, seconds=np.array(seconds))
-        self.add_test(looked)
-        self.returns = looked["eval_return"]
+        self._append(**eval_metrics, **counts, updates=self.updates, seconds=np.array(seconds))
+        self.count_steps(eval_metrics)
+        self.returns = eval_metrics["eval_return"]
         self.seen = self.env_steps.copy()
         # Columns of metrics.csv are singular: a row is of one update of one seed.
         seeds = self.config.first_seed + np.arange(len(self.updates))
         counts |= {"seed": seeds, "update": self.updates}
         last = {name: x[0] for name, x in self._columns("last").items()}
-        return as_rows(last | looked | counts, seconds)
+        return as_rows(last | eval_metrics | counts, seconds)
 
     def progress(self) -> Progress:
         """Returns how far the run is, right after an evaluation."""
@@ -462,17 +465,17 @@ class RunRecord(Record):
         fractions = used(self.config, latest["env_steps"], latest["updates"])
         fractions = np.minimum(fractions, 1.0).mean(axis=-1).tolist()
         seconds = latest["seconds"].tolist()
-        return self.measure(
+        return self.progress_at(
             fraction=fractions[-1],
             seconds=seconds[-1],
             gained=fractions[-1] - fractions[0],
             passed=seconds[-1] - seconds[0],
         )
 
-    def add_test(self, looked: Arrays) -> None:
-        """Counts what an evaluation or a test simulated, of ``programs.evaluate``."""
-        self.simulated += _sum(looked["simulated_steps"])
-        self.evaluated += _sum(looked["eval_steps"])
+    def count_steps(self, eval_metrics: Arrays) -> None:
+        """Counts the steps of an evaluation or a test, of what ``programs.evaluate`` returns."""
+        self.simulated += _sum(eval_metrics["simulated_steps"])
+        self.evaluated += _sum(eval_metrics["eval_steps"])
 
     def over(self) -> bool:
         """Returns whether the budget is used, or nothing is finite any more."""

@@ -93,7 +93,8 @@ class Compiled(NamedTuple):
     begin: (seed, the numbers [W] of the runs' seeds, settings [W] each) -> the first states [W, B],
       and the data of the keys [K, W] of the last test
     advance: (states [W, B], budget, which lanes have a run [W], whether to evaluate []) -> (states
-      [W, B], metrics [K, W] each, what was evaluated [W] each, if that rides), as in ``Measured``
+      [W, B], metrics [K, W] each, what was evaluated [W] each, if it evaluates), as in
+      ``Measured``
     evaluate: (states [W, B], which [W]) -> what ``programs.evaluate`` returns [W] each
     width: W, the runs of a slot
     programs: that were compiled
@@ -129,7 +130,7 @@ class Slots:
         programs = compiled.programs
         division = programs.division
         self._compiled = compiled
-        self._rides = programs.rides
+        self._advance_evaluates = programs.advance_evaluates
         self._division = division
         self.layout = StateRows(programs.like)
         self.budget = Budget.of(compiled.config.env_steps, compiled.config.max_updates)
@@ -173,24 +174,24 @@ class Slots:
         chosen: np.ndarray | None = None,
         lengths: np.ndarray | None = None,
         *,
-        look: bool = True,
-        most: int = 1,
+        evaluate: bool = True,
+        max_blocks: int = 1,
     ) -> list[Measured]:
         """Evaluates runs and makes a block of updates, several times.
 
         Args:
           chosen: [R] which of them, at least one; all by default.
           lengths: [R] about how long their episodes are, see ``pack_slots``.
-          look: whether to evaluate before the first block.
-          most: how many blocks, where a slot holds these runs. Else they are packed again after
-            one.
+          evaluate: whether to evaluate before the first block.
+          max_blocks: how many blocks, where a slot holds these runs. Else they are packed again
+            after one.
 
         Returns:
           What was measured in each block in which a run made an update.
         """
         lanes = self._pack(chosen, lengths)
         programs = self._compiled
-        num_blocks = most if len(lanes) == 1 else 1
+        num_blocks = max_blocks if len(lanes) == 1 else 1
         budget = self._division.put(tuple(self.budget), NONE)
 
         def move(runs: np.ndarray) -> Any:
@@ -198,21 +199,21 @@ class Slots:
             states = self._put(runs)
             occupied = self._division.put(runs >= 0)
             blocks = []
-            looks = look
+            evaluation_due = evaluate
             # Calls return before the device is done, and nothing here reads a result: the device
             # goes from block to block without waiting for the host, which fetches all at the end.
             for _ in range(num_blocks):
-                looked = {}
-                if looks and not self._rides:
-                    looked = programs.evaluate(states, occupied)
-                flag = self._division.put(np.bool_(looks), NONE)
-                states, metrics, riding = programs.advance(states, budget, occupied, flag)
+                eval_metrics = {}
+                if evaluation_due and not self._advance_evaluates:
+                    eval_metrics = programs.evaluate(states, occupied)
+                flag = self._division.put(np.bool_(evaluation_due), NONE)
+                states, metrics, launch_metrics = programs.advance(states, budget, occupied, flag)
                 # Without an evaluation a program returns its arrays all the same, and they say
                 # nothing.
-                if looks:
-                    looked |= riding
-                blocks.append((metrics, looked))
-                looks = True  # the block has changed the policies
+                if evaluation_due:
+                    eval_metrics |= launch_metrics
+                blocks.append((metrics, eval_metrics))
+                evaluation_due = True  # the block has changed the policies
             return states, *jax.device_get((states, blocks))
 
         placed, rows, blocks = zip(*_side_by_side(move, lanes), strict=True)
@@ -226,8 +227,8 @@ class Slots:
         return [measured for measured in joined if measured.metrics["active"].any()]
 
     def seconds_to_evaluate(self) -> float:
-        """Returns how long an evaluation takes (s) that does not ride with the updates."""
-        if self._rides:
+        """Returns how long an evaluation takes (s) that shares no launch with the updates."""
+        if self._advance_evaluates:
             return 0.0
         start = time.perf_counter()
         self.evaluate()
@@ -238,11 +239,11 @@ class Slots:
         lanes = self._pack()
         programs = self._compiled
 
-        def look(runs: np.ndarray) -> Any:
+        def evaluate_slot(runs: np.ndarray) -> Any:
             occupied = self._division.put(runs >= 0)
             return {}, jax.device_get(programs.evaluate(self._put(runs), occupied))
 
-        return _of_slots(lanes, _side_by_side(look, lanes))
+        return _of_slots(lanes, _side_by_side(evaluate_slot, lanes))
 
     def test(self, actor: Actor) -> Arrays:
         """Returns what ``programs.evaluate`` does of policies [R, ...], on starts of their own.
@@ -257,7 +258,7 @@ class Slots:
         # have these, and are put back afterwards.
         for keys in map(jax.random.wrap_key_data, self._test_keys):
             self.restore(dataclasses.replace(states, train_states=train_states, eval_keys=keys))
-            evaluations.append(self.evaluate().looked)
+            evaluations.append(self.evaluate().eval_metrics)
         self._rows = rows
         self._placed = None
         tested = {}
@@ -310,11 +311,11 @@ def _of_slots(lanes: np.ndarray, slots: Sequence[tuple[Arrays, Arrays]]) -> Meas
     runs = lanes.reshape(-1)
     # Empty lanes, -1, are sorted to the front and cut off.
     order = np.argsort(runs, kind="stable")[np.sum(runs < 0) :]
-    metrics, looked = (
+    metrics, eval_metrics = (
         {name: np.concatenate([x[name] for x in kind], axis=-1)[..., order] for name in kind[0]}
         for kind in zip(*slots, strict=True)
     )
-    return Measured(runs[order], metrics, looked)
+    return Measured(runs[order], metrics, eval_metrics)
 
 
 def compile_slots(programs: Programs, config: Config, width: int) -> Compiled:
@@ -332,7 +333,7 @@ def compile_slots(programs: Programs, config: Config, width: int) -> Compiled:
     size = StateRows(programs.like).size
     check_room(2.0 * width * size)  # the states before a block of updates, and after it
     rows, occupied = division.put((np.zeros((width, size), np.uint8), np.zeros(width, bool)))
-    no_budget, no_look = division.put((tuple(Budget.of(0, 0)), np.bool_(False)), NONE)
+    no_budget, no_evaluation = division.put((tuple(Budget.of(0, 0)), np.bool_(False)), NONE)
     # XLA compiles without Python's lock: while one program compiles in a thread, the next one is
     # traced here.
     begin_task = started(functools.partial(_compile_begin, programs, width))
@@ -342,14 +343,14 @@ def compile_slots(programs: Programs, config: Config, width: int) -> Compiled:
     advance_jit = division.jit(
         programs.advance, (RUNS, NONE, RUNS, NONE), (RUNS, SECOND, RUNS), by_episodes=True
     )
-    advance_lowered = advance_jit.lower(rows, no_budget, occupied, no_look)
+    advance_lowered = advance_jit.lower(rows, no_budget, occupied, no_evaluation)
     advance_task = started(functools.partial(executable, advance_lowered))
     advance = advance_task.result()
     evaluate = evaluate_task.result()
     check_fits(advance)
     check_fits(evaluate)
     # Without a run: a GPU's driver translates the kernels of a program when it first runs.
-    jax.block_until_ready(advance(rows, no_budget, occupied, no_look))
+    jax.block_until_ready(advance(rows, no_budget, occupied, no_evaluation))
     return Compiled(begin_task.result(), advance, evaluate, width, programs, config)
 
 

@@ -39,13 +39,13 @@ def trained(config, division):
     """Returns all that a run comes to, on the host; how much was simulated is each device's own."""
     prepared = ready.made(envs.make(config.env), config, division=division)
     slots = compile_run(prepared.programs(), config)
-    before, [(_, metrics, looked)], state = slots.states(), slots.advance(), slots.states()
+    before, [(_, metrics, eval_metrics)], state = slots.states(), slots.advance(), slots.states()
     assert all(len(x) == config.num_seeds for x in jax.tree.leaves(plain(state)))
     tested = slots.test(state.train_states.actor)
-    for measured in (metrics, looked, tested):
+    for measured in (metrics, eval_metrics, tested):
         del measured["simulated_steps"]
-    again = slots.evaluate().looked["eval_return"]
-    return jax.device_get(plain((before, state))), metrics, looked, tested, again
+    again = slots.evaluate().eval_metrics["eval_return"]
+    return jax.device_get(plain((before, state))), metrics, eval_metrics, tested, again
 
 
 def stepped(config, division):

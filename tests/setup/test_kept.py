@@ -60,8 +60,8 @@ def numbers(prepared, config):
     """
     slots, measured = compile_run(prepared.programs(), config), []
     for _ in range(2):
-        [(_, metrics, looked)] = slots.advance()
-        measured += [metrics, looked, slots.evaluate().looked]
+        [(_, metrics, eval_metrics)] = slots.advance()
+        measured += [metrics, eval_metrics, slots.evaluate().eval_metrics]
     state = slots.states().train_states
     leaves = [jax.random.key_data(state.key), state.env_steps, *jax.tree.leaves(state.actor)]
     measured.append(slots.test(state.actor))
@@ -325,8 +325,8 @@ if sys.argv[1] == "second":
     envs.make = None
 config = Config(env="InvertedPendulum-v5", num_seeds=2, num_episodes=2, eval_episodes=2)
 prepared = ready.get_ready(config, config)
-[(_, metrics, looked)] = compile_run(prepared.programs(), config).advance()
-print(prepared.engine, metrics["episode_return"].tolist(), looked["eval_return"])
+[(_, metrics, eval_metrics)] = compile_run(prepared.programs(), config).advance()
+print(prepared.engine, metrics["episode_return"].tolist(), eval_metrics["eval_return"])
 print("mujoco" in sys.modules)
 """
 

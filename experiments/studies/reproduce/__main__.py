@@ -104,9 +104,9 @@ def train(case: Case, config: Config, *, stale: bool = False) -> np.ndarray:
     traced = programs_of(env, lambda _: learner, horizon, config, config.num_seeds)
     slots, scores = compile_run(traced, config), []
     for _ in range(-(-config.max_updates // config.eval_every)):
-        [measured] = slots.advance(look=False)
+        [measured] = slots.advance(evaluate=False)
         if case.score == "eval_return":
-            scores.append(slots.evaluate().looked[case.score][None])
+            scores.append(slots.evaluate().eval_metrics[case.score][None])
         else:
             scores.append(measured.metrics[case.score])
     return np.concatenate(scores)[: config.max_updates]
