@@ -9,7 +9,7 @@ from typing import Any
 
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.runs.display import Display, SweepScreen
-from mjx_reinforce.runs.plan import Part, Prepared
+from mjx_reinforce.runs.plan import Part, Plan
 from mjx_reinforce.runs.saving import Files
 from mjx_reinforce.setup.compile_times import keep_seconds
 from mjx_reinforce.training.driver import Driver, Observer, RunDriver, Runs, begin_run
@@ -18,7 +18,7 @@ from mjx_reinforce.training.slots import Compiled, Slots, Stopwatch, compile_slo
 
 
 def conduct(
-    prepared: Prepared,
+    plan: Plan,
     files: Files[Any] | None,
     display: Display,
     observers: Sequence[Observer[Any]],
@@ -27,7 +27,7 @@ def conduct(
     """Trains the chunks that have not ended yet, to their end or until they are interrupted.
 
     Args:
-      prepared: what a run or a sweep is made of.
+      plan: what a run or a sweep is made of.
       files: of it, if it has any.
       display: its screen.
       observers: who sees it, besides these.
@@ -42,17 +42,17 @@ def conduct(
     written = [] if files is None else [files]
     left = [
         part._replace(chunks=[x for x in part.chunks if not any(f.has(x.name) for f in written)])
-        for part in prepared.parts
+        for part in plan.parts
     ]
-    screen = display if prepared.alone else SweepScreen(display, prepared, left)
-    everyone, clock = [*written, screen, *observers], prepared.clock
+    screen = display if plan.alone else SweepScreen(display, plan, left)
+    everyone, clock = [*written, screen, *observers], plan.clock
     chunks = _compiled([part for part in left if part.chunks], clock)
     chunks = itertools.chain([*itertools.islice(chunks, 1)], chunks)  # compiles the first
     clock.compiling = time.perf_counter() - clock.began
     # Where others compute beside this, what it computed itself is nearer to a quiet machine's time.
     quiet = min(clock.compiling, time.process_time() - clock.computed)
     if any(part.chunks for part in left):
-        keep_seconds(prepared.design.configs[0], prepared.design.over, quiet)
+        keep_seconds(plan.design.configs[0], plan.design.over, quiet)
     # Not before: a kill while it compiles leaves nothing that would refuse the next.
     interrupt.defer(display.say)
     for each in written:
@@ -63,8 +63,8 @@ def conduct(
         config = dataclasses.replace(part.group.config, num_seeds=len(runs.seed))
         settings = {name: values[runs.place] for name, values in part.group.settings.items()}
         slots = Slots(compiled, runs.seed, settings)
-        if prepared.alone:
-            given = config, part.ready.threshold, slots, runs, prepared.found, prepared.actors
+        if plan.alone:
+            given = config, part.ready.threshold, slots, runs, plan.found, plan.actors
             driver = begin_run(*given, display.say, everyone, interrupt.heard)
         else:
             driver = Driver(config, slots, Record(config), runs, everyone)
@@ -77,7 +77,7 @@ def conduct(
             break
     if isinstance(driver, RunDriver):
         # A signal after that changes nothing: what is left takes a second or two.
-        test, engine = driver.test(interrupt.heard), prepared.parts[0].ready.engine
+        test, engine = driver.test(interrupt.heard), plan.parts[0].ready.engine
         summary = driver.summary(engine, clock.compiling, test)
     else:
         assert files is not None

@@ -18,7 +18,7 @@ from rich.text import Text
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.reports.experiment import counted, say, setting_in_words
-from mjx_reinforce.runs.plan import Part, Prepared
+from mjx_reinforce.runs.plan import Part, Plan
 from mjx_reinforce.statistics import enough, iqm
 from mjx_reinforce.training import record
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer, RunDriver
@@ -159,9 +159,9 @@ class Display(Observer[RunDriver]):
 class SweepScreen(Observer[Driver]):
     """Shows how far a sweep is, and which of its runs are trained."""
 
-    def __init__(self, display: Display, prepared: Prepared, parts: Iterable[Part]):
+    def __init__(self, display: Display, plan: Plan, parts: Iterable[Part]):
         """Takes the display, the sweep, and what of it is to be trained."""
-        self._display, self._prepared = display, prepared
+        self._display, self._plan = display, plan
         #: Runs that have ended here, what checkpoints brought of them, and of how many.
         self._done, self._brought = 0, 0.0
         self._total = sum(len(runs.seed) for part in parts for runs in part.chunks)
@@ -169,7 +169,7 @@ class SweepScreen(Observer[Driver]):
     def began(self, driver: Driver) -> None:
         """Says which configurations the lines that follow are of."""
         self._brought += driver.record.used_up()
-        runs, every = driver.runs, self._prepared.design.configurations
+        runs, every = driver.runs, self._plan.design.configurations
         here = [every[number] for number in np.unique(runs.configuration)]
         values = {name: [*dict.fromkeys(say(values[name]) for values in here)] for name in here[0]}
         count = f"{counted(len(here), 'configuration')} of {len(every):,}"
@@ -181,7 +181,7 @@ class SweepScreen(Observer[Driver]):
         """Shows how far it is."""
         done = self._done + driver.record.used_up()
         fraction, gained = float(done / self._total), float(done - self._brought) / self._total
-        running = self._prepared.clock.running()
+        running = self._plan.clock.running()
         now = driver.record.progress_at(fraction, driver.seconds(), gained, running)
         self._display.show_progress(now)
 

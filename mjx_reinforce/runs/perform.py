@@ -203,7 +203,7 @@ def perform(
             configure_jax()
             from mjx_reinforce.envs.instability import instability
             from mjx_reinforce.runs.conduct import conduct
-            from mjx_reinforce.runs.plan import describe, prepare
+            from mjx_reinforce.runs.plan import describe, make_plan
             from mjx_reinforce.runs.saving import RunFiles, SweepFiles
             from mjx_reinforce.setup.compile_times import describe_compiling
         except MemoryError as error:
@@ -214,17 +214,17 @@ def perform(
         if (model := getattr(env, "mj_model", None)) is not None:
             display.warn_of_model(instability(model))
         with display.console.status("writing the simulation out"):
-            prepared = prepare(design, known, env, display.say)
-        display.say(describe(prepared))
+            plan = make_plan(design, known, env, display.say)
+        display.say(describe(plan))
         display.say(describe_compiling(first, design.over))
         with display:
             kind = SweepFiles if design.over else RunFiles
             written = None
             if directory is not None and place is not None:
                 check_place(directory, place)  # writing the simulation out took its time
-                written = kind(directory, prepared, display.say)
-            driver, summary = conduct(prepared, written, display, observers, interrupt)
-        return Outcome(directory, summary, driver, prepared.parts[0].ready.policy, display)
+                written = kind(directory, plan, display.say)
+            driver, summary = conduct(plan, written, display, observers, interrupt)
+        return Outcome(directory, summary, driver, plan.parts[0].ready.policy, display)
 
 
 def _display(*, quiet: bool) -> "Display":

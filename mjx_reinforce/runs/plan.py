@@ -22,7 +22,7 @@ from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.defaults import num_cores
 from mjx_reinforce.settings.groups import Reader
 from mjx_reinforce.setup.provenance import provenance
-from mjx_reinforce.setup.ready import Ready, get_ready
+from mjx_reinforce.setup.ready import Ready, load_or_build_ready
 from mjx_reinforce.training import resume
 from mjx_reinforce.training.division import Division
 from mjx_reinforce.training.driver import Runs
@@ -66,7 +66,7 @@ class Part(NamedTuple):
     chunks: list[Runs]
 
 
-class Prepared(NamedTuple):
+class Plan(NamedTuple):
     """All that a run or a sweep is made of.
 
     design: what it is to do
@@ -92,12 +92,12 @@ class Prepared(NamedTuple):
         return not self.design.over
 
 
-def prepare(
+def make_plan(
     design: Design,
     known: Mapping[str, Any],
     env: Environment | None,
     say: Callable[[str], None],
-) -> Prepared:
+) -> Plan:
     """Returns what a run or a sweep is made of.
 
     Args:
@@ -114,15 +114,15 @@ def prepare(
         resume.check_same_program(design.directory, known, provenance())
         found = None if design.over else resume.newest_checkpoint(design.base, say)
     if design.over:
-        return Prepared(design, *_prepare_sweep(design, known), known, None, None, clock)
+        return Plan(design, *_plan_sweep(design, known), known, None, None, clock)
     config, division, actors = design.base, divide_run(design.base), None
-    ready = get_ready(config, design.default or config, env, division)
+    ready = load_or_build_ready(config, design.default or config, env, division)
     if config.init_from is not None and found is None:
         actors = last_actors(config, ready.policy)
     config = dataclasses.replace(config, horizon=ready.horizon)
     group, width = Group(config, np.zeros(1, int), {}), division.lanes(config.num_seeds)
     part = Part(group, ready, config.num_seeds, width, split_runs(group, "000", 1))
-    return Prepared(design, [part], division, known, found, actors, clock)
+    return Plan(design, [part], division, known, found, actors, clock)
 
 
 #: Episodes are divided among GPUs only where each plays so many of an update, of all seeds: fewer
@@ -154,7 +154,7 @@ def divide_run(config: Config) -> Division:
     return Division(episodes=episodes) if enough and num_seeds / episodes < width else by_seeds
 
 
-def _prepare_sweep(design: Design, known: Mapping[str, Any]) -> tuple[list[Part], Division]:
+def _plan_sweep(design: Design, known: Mapping[str, Any]) -> tuple[list[Part], Division]:
     """Returns the groups of a sweep, and what divides them.
 
     ``known`` is its sweep.json, if it goes on.
@@ -173,7 +173,7 @@ def _prepare_sweep(design: Design, known: Mapping[str, Any]) -> tuple[list[Part]
         chosen = vars(config).keys() & {*design.given, *design.over}
         unset = {name: None for name in chosen if is_read(name, config)}
         default: Any = dataclasses.replace(config, **unset)
-        ready = get_ready(config, default, division=division, traced=traced)
+        ready = load_or_build_ready(config, default, division=division, traced=traced)
         part, limit = Part(group, ready, 0, 0, []), design.chunk_runs
         if known:
             limit = known["chunk_runs"][number]
@@ -287,19 +287,19 @@ def _capacity(part: Part) -> int:
     return max(1, int(_MEMORY * host_memory() / (_COPIES * size)))
 
 
-def describe(prepared: Prepared) -> str:
+def describe(plan: Plan) -> str:
     """Returns a sentence on what a run or a sweep will do on this machine."""
-    parts, first, ready = prepared.parts, prepared.parts[0].group.config, prepared.parts[0].ready
+    parts, first, ready = plan.parts, plan.parts[0].group.config, plan.parts[0].ready
     what, said = f"{counted(first.num_seeds, 'seed')} of {first.env}", ""
-    if not prepared.alone:
+    if not plan.alone:
         runs = [len(runs.seed) for part in parts for runs in part.chunks]
-        what = f"{counted(prepared.design.count(), 'configuration')} of {what}, {sum(runs):,} runs,"
+        what = f"{counted(plan.design.count(), 'configuration')} of {what}, {sum(runs):,} runs,"
         said = (
             f"; {counted(len(parts), 'compiled program')}, {counted(len(runs), 'chunk')} of up to "
             f"{max(runs):,} runs"
         )
     return (
-        f"Training {what} by {first.algorithm}, {_budget(first)}, on {_where(prepared.division)}, "
+        f"Training {what} by {first.algorithm}, {_budget(first)}, on {_where(plan.division)}, "
         f"with the engine {ready.engine}: {ready.why}{said}."
     )
 

@@ -32,7 +32,7 @@ from mjx_reinforce.files import (
 from mjx_reinforce.reports.charts import curves
 from mjx_reinforce.reports.experiment import lengthened
 from mjx_reinforce.runs.design import as_record
-from mjx_reinforce.runs.plan import Part, Prepared
+from mjx_reinforce.runs.plan import Part, Plan
 from mjx_reinforce.runs.sinks import Sink, open_sinks
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup.provenance import provenance
@@ -57,17 +57,17 @@ class Files(Observer[DriverT]):
     #: Folders in which files are written, beside the directory itself.
     _folders: tuple[str, ...] = ()
 
-    def __init__(self, directory: Path, prepared: Prepared, say: Callable[[str], None]):
+    def __init__(self, directory: Path, plan: Plan, say: Callable[[str], None]):
         """Takes the files before they are there.
 
         Args:
           directory: where they are.
-          prepared: what the run or the sweep is made of.
+          plan: what the run or the sweep is made of.
           say: shows a line to the user.
         """
-        self._directory, self._prepared, self._say = directory, prepared, say
+        self._directory, self._plan, self._say = directory, plan, say
         self._place = directory.stat()
-        self.contents = dict(prepared.known)
+        self.contents = dict(plan.known)
         #: What could not be written when it was last tried, and what is said of it.
         self._failing: set[str] = set()
         self._hope = "; training goes on and tries again"
@@ -156,9 +156,9 @@ class RunFiles(Files[RunDriver]):
 
     _folders = ("policy", "policy/best", "wandb")
 
-    def __init__(self, directory: Path, prepared: Prepared, say: Callable[[str], None]):
+    def __init__(self, directory: Path, plan: Plan, say: Callable[[str], None]):
         """Takes the files of a run, before they are there; arguments as of ``Files``."""
-        super().__init__(directory, prepared, say)
+        super().__init__(directory, plan, say)
         self._metrics, self._checkpoints = directory / "metrics.csv", directory / "checkpoint"
         #: Rows that could not be written yet.
         self._waiting = b""
@@ -171,7 +171,7 @@ class RunFiles(Files[RunDriver]):
         Raises:
           OSError: a file cannot be written.
         """
-        found, reached = self._prepared.found, None
+        found, reached = self._plan.found, None
         self._go_on(driver, found)
         if driver.config.resume is None:
             self._write_first(driver.config)
@@ -253,7 +253,7 @@ class RunFiles(Files[RunDriver]):
 
     def _save_policies(self, driver: RunDriver) -> None:
         """Writes the last and the best policies."""
-        settings = self._prepared.parts[0].ready.policy
+        settings = self._plan.parts[0].ready.policy
         save_policy(self._folder("policy"), driver.states.train_states.actor, settings)
         save_policy(self._folder("policy", "best"), driver.best.actor, settings)
 
@@ -278,15 +278,15 @@ class SweepFiles(Files[Driver]):
 
     _folders = ("parts",)
 
-    def __init__(self, directory: Path, prepared: Prepared, say: Callable[[str], None]):
+    def __init__(self, directory: Path, plan: Plan, say: Callable[[str], None]):
         """Takes the files of a sweep, before they are there; arguments as of ``Files``."""
-        super().__init__(directory, prepared, say)
+        super().__init__(directory, plan, say)
         self._parts = directory / "parts"
         self.contents = self._contents()
 
     def _contents(self) -> dict[str, Any]:
         """Returns what sweep.json says while the sweep goes on."""
-        design, parts, known = self._prepared.design, self._prepared.parts, self._prepared.known
+        design, parts, known = self._plan.design, self._plan.parts, self._plan.known
         return {
             "status": "running",
             "env": design.base.env,
@@ -298,7 +298,7 @@ class SweepFiles(Files[Driver]):
                 for number, values in enumerate(design.configurations)
             ],
             "chunk_runs": [part.limit for part in parts],
-            "local_devices": self._prepared.division.count,
+            "local_devices": self._plan.division.count,
             "engine": parts[0].ready.engine,
             "compile_seconds": known.get("compile_seconds", 0.0),
             "run_seconds": known.get("run_seconds", 0.0),
@@ -342,7 +342,7 @@ class SweepFiles(Files[Driver]):
             write_arrays(self._directory / "curves.npz", curves)
         if summary["status"] == "finished":
             shutil.rmtree(self._directory / "policies", ignore_errors=True)
-            for part in self._prepared.parts:
+            for part in self._plan.parts:
                 self._write_policies(part, [parts[runs.name] for runs in part.chunks])
         self._write_json("sweep.json", summary)
         if summary["status"] == "finished":
@@ -388,7 +388,7 @@ class SweepFiles(Files[Driver]):
             seeds, returns = ends.pop("seed"), ends.pop("eval_return").astype(np.float64)
             del ends["configuration"]
             place = self._folder("policies", f"{number:03d}")
-            config = self._prepared.design.configs[number]
+            config = self._plan.design.configs[number]
             traced = {k: getattr(config, k) for k in part.group.settings if k in policy}
             folder = self._folder("policies", place.name, "policy")
             save_policy(folder, actor_of(ends), policy | traced)

@@ -1,6 +1,6 @@
-"""A run made ready: what its settings come to, and its programs before they are compiled.
+"""A run that is ready: what its settings come to, and its programs before they are compiled.
 
-Programs are kept on disk, as JAX exports them: a run that was compiled before is not traced. They
+Programs are saved on disk, as JAX exports them: a run that was compiled before is not traced. They
 lie beside XLA's compiled programs in JAX's cache, under a hash of all that they depend on: every
 source file of this package, the versions of others, the settings, the device. What a run begins
 with (its seeds) and when it ends are inputs of its programs. What they take and return is described
@@ -54,7 +54,7 @@ class Ready(NamedTuple):
     programs: Callable[[], Programs]
 
 
-def get_ready(
+def load_or_build_ready(
     config: Config,
     default: Config,
     env: Environment | None = None,
@@ -67,8 +67,8 @@ def get_ready(
       config: the settings.
       default: those that hold where the user gave none.
       env: the environment; by default the one that the settings name, built if it is needed.
-      division: see ``made``.
-      traced: see ``made``.
+      division: see ``build_ready``.
+      traced: see ``build_ready``.
 
     Raises:
       ValueError: the settings do not fit the environment.
@@ -79,33 +79,33 @@ def get_ready(
         key = key_of(config)
     ready = None
     if key is not None:
-        ready = _read_of_settings(key, config, division)
+        ready = _load_of_settings(key, config, division)
     if ready is None:
         task = envs.make_set(config.env, config.env_set) if env is None else env
-        ready = made(task, config, division, traced)
+        ready = build_ready(task, config, division, traced)
         if key is not None:
-            ready = keep(key, ready)
+            ready = save_ready(key, ready)
     if config.resume is None and config.policy == "auto":
         check_read_by_policy(config, default, ready.policy["policy"])
     return ready
 
 
-def _read_of_settings(key: str, config: Config, division: Division) -> Ready | None:
+def _load_of_settings(key: str, config: Config, division: Division) -> Ready | None:
     """Returns what is on disk of the settings; None if nothing is."""
-    ready = read_ready(key, division)
+    ready = load_ready(key, division)
     if ready is not None or config.resume is None:
         return ready
     # A run that is resumed has its time limit from config.json, also one that was not given: its
     # programs may be there under the key without a limit.
     first_key = key_of(dataclasses.replace(config, horizon=None))
     if first_key is not None:
-        ready = read_ready(first_key, division)
+        ready = load_ready(first_key, division)
     if ready is not None and ready.horizon != config.horizon:
         return None
     return ready
 
 
-def made(
+def build_ready(
     env: Environment,
     config: Config,
     division: Division = ALONE,
@@ -199,14 +199,14 @@ def key_of(config: Config) -> str | None:
     return hashlib.sha256(json.dumps(dependencies, sort_keys=True).encode()).hexdigest()
 
 
-def keep(key: str, ready: Ready) -> Ready:
-    """Returns what is made ready, with programs that are written to disk when they are traced.
+def save_ready(key: str, ready: Ready) -> Ready:
+    """Returns the same with programs that are written to disk when they are traced.
 
-    A program that JAX cannot export, such as one that calls Python, is not kept.
+    A program that JAX cannot export, such as one that calls Python, is not saved.
 
     Args:
       key: of ``key_of``.
-      ready: all of it but the programs is in JSON's types.
+      ready: what is saved; all of it but the programs is in JSON's types.
     """
     programs = ready.programs()
     like = programs.like
@@ -245,8 +245,8 @@ def keep(key: str, ready: Ready) -> Ready:
     return ready._replace(programs=lambda: programs)
 
 
-def read_ready(key: str, division: Division = ALONE) -> Ready | None:
-    """Returns what was kept under a name; None unless all of it is on disk."""
+def load_ready(key: str, division: Division = ALONE) -> Ready | None:
+    """Returns what ``save_ready`` wrote under a key; None unless all of it is on disk."""
     cache = Cache.find()
     if cache is None:
         return None

@@ -37,7 +37,7 @@ def close(one, other):
 
 def trained(config, division):
     """Returns all that a run comes to, on the host; how much was simulated is each device's own."""
-    prepared = ready.made(envs.make(config.env), config, division=division)
+    prepared = ready.build_ready(envs.make(config.env), config, division=division)
     slots = compile_run(prepared.programs(), config)
     before, [(_, metrics, eval_metrics)], state = slots.states(), slots.advance(), slots.states()
     assert all(len(x) == config.num_seeds for x in jax.tree.leaves(plain(state)))

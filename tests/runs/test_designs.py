@@ -8,7 +8,7 @@ import pytest
 
 from mjx_reinforce.runs import design, plan
 from mjx_reinforce.runs.design import Design
-from mjx_reinforce.runs.plan import Group, describe, make_groups, prepare
+from mjx_reinforce.runs.plan import Group, describe, make_groups, make_plan
 from mjx_reinforce.settings.config import Config
 
 CONFIG = Config(env_steps=1000, max_updates=7, num_seeds=3, num_episodes=16)
@@ -128,7 +128,7 @@ OVER = {"num_episodes": [2, 4], "learning_rate": [1e-3, 1e-2, 1e-1]}
 
 
 def prepared(base=BASE, known=MappingProxyType({}), **changes):
-    return prepare(Design(base=base, over=OVER, **changes), known, None, pytest.fail)
+    return make_plan(Design(base=base, over=OVER, **changes), known, None, pytest.fail)
 
 
 def test_a_group_is_what_shares_its_programs():

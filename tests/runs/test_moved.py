@@ -75,7 +75,7 @@ def test_it_ends_while_it_trains(run, monkeypatch, capsys, command, loss):
 def test_it_ends_before_it_trains(run, monkeypatch, capsys, command):
     """Where another run began in its place while this one wrote its simulation out."""
     main, arguments = COMMANDS[command]
-    lose(monkeypatch, plan, "prepare", 1, replace)
+    lose(monkeypatch, plan, "make_plan", 1, replace)
     check_lost(run(*arguments, command=main), "replaced", capsys)
 
 

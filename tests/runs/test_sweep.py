@@ -166,7 +166,7 @@ def test_numbers_of_shifts_dampings_and_values_are_traced(monkeypatch):
     }
     key = jax.random.key(3)
     monkeypatch.setattr(ready, "programs_of", lambda env, build, *more, **options: build)
-    builder = ready.made(Drift(), group.config, ALONE, tuple(group.settings)).programs()
+    builder = ready.build_ready(Drift(), group.config, ALONE, tuple(group.settings)).programs()
 
     def trained(learner):
         states = jax.lax.scan(lambda x, _: (learner.step(x)[0], None), learner.init(key), None, 2)

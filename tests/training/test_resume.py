@@ -209,7 +209,7 @@ def test_a_full_disk_is_refused_at_once(run, parts, tmp_path, monkeypatch, capsy
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     arguments = ["--resume", "parts"] if resumed else [*COMMON, "--output", "new/out"]
     before = sorted(tmp_path.rglob("*"))
-    monkeypatch.setattr(plan, "prepare", pytest.fail)
+    monkeypatch.setattr(plan, "make_plan", pytest.fail)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:
         code = run(*arguments, "--max-updates", 30)

@@ -22,7 +22,7 @@ CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, e
 @pytest.fixture(scope="module")
 def prepared():
     """A run of CartPole that is ready."""
-    return ready.made(envs.make(CONFIG.env), CONFIG)
+    return ready.build_ready(envs.make(CONFIG.env), CONFIG)
 
 
 def test_the_keys_of_seeds_are_those_of_a_split():
@@ -74,7 +74,7 @@ def test_evaluations_ride_with_the_updates_that_follow(prepared):
 def test_a_seed_begins_alike_whichever_begin_with_it():
     """So do the seeds that a process has, and those of a slot."""
     config = dataclasses.replace(LUCK, num_seeds=4, test_episodes=6)
-    begin = jax.jit(ready.made(Luck(), config).programs().begin)
+    begin = jax.jit(ready.build_ready(Luck(), config).programs().begin)
     every, all_keys = begin(3, np.arange(4, dtype=np.uint32), {})
     some, keys = begin(3, np.array([2, 0], np.uint32), {})
     assert np.array_equal(some, every[np.array([2, 0])])
@@ -99,7 +99,7 @@ LUCK = Config(env="Luck-v0", num_seeds=3, hidden_sizes=(), eval_episodes=2, test
 def evaluations(**changes):
     """Returns what settings evaluate to before and after an update, and what they test to."""
     config = dataclasses.replace(LUCK, **changes)
-    slots = compile_run(ready.made(Luck(), config).programs(), config)
+    slots = compile_run(ready.build_ready(Luck(), config).programs(), config)
     [first], later = slots.advance(), slots.evaluate()
     return first.eval_metrics, later.eval_metrics, slots.test(slots.states().train_states.actor)
 
@@ -132,7 +132,7 @@ def test_training_is_cut_for_a_share_of_the_budget_and_evaluations_never(share):
     config = dataclasses.replace(
         CONFIG, num_seeds=1, env_steps=800, train_horizon=8, whole_after=share, eval_every=1
     )
-    prepared = ready.made(envs.make(config.env), config)
+    prepared = ready.build_ready(envs.make(config.env), config)
     assert prepared.horizon == 500
     assert prepared.programs().advance_evaluates == (share < 1)
     slots, steps, cut, whole = compile_run(prepared.programs(), config), 0, [], []
@@ -150,6 +150,6 @@ def test_training_is_cut_for_a_share_of_the_budget_and_evaluations_never(share):
 def test_a_cut_after_the_time_limit_is_none():
     """So a task that cuts its episodes by default takes any ``--horizon``."""
     config = dataclasses.replace(CONFIG, horizon=20, train_horizon=100)
-    prepared = ready.made(envs.make(CONFIG.env), config)
+    prepared = ready.build_ready(envs.make(CONFIG.env), config)
     assert prepared.horizon == 20
     assert prepared.programs().advance_evaluates
