@@ -51,6 +51,9 @@ _METRICS = (
     "skipped_update",
 )
 
+#: Among the metrics of an update, the episodes of the evaluation that shared its launch.
+_EVALUATION = "evaluation episodes"
+
 
 class EvaluationEpisodes(NamedTuple):
     """E episodes that are played in one launch with an update, and from which nothing learns.
@@ -69,11 +72,22 @@ class EvaluationEpisodes(NamedTuple):
         return jnp.arange(len(self.keys)) < self.num_modes
 
 
+class SharedEpisodes(NamedTuple):
+    """What one launch played.
+
+    training: [T, N] the episodes of an update
+    evaluation: [T, E] those of an evaluation; None without one
+    """
+
+    training: Trajectory
+    evaluation: Trajectory | None
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class SharedLaunch:
     """A ``Learner.play`` whose launch may play an evaluation too, and is divided among devices.
 
-    learner: whose ``play`` takes another rollout, as that of ``reinforce`` does
+    learner: whose ``play`` takes another rollout and returns what that does, see ``RolloutPlay``
     devices: among which the episodes of an update are divided; they stay where they are played, and
       XLA divides what is computed from them. Their count divides every number of episodes that an
       update has room for. None plays where ``jax.jit`` computes
@@ -86,7 +100,7 @@ class SharedLaunch:
         self, state: TrainState, key: jax.Array, active: bool | jax.Array = True
     ) -> Trajectory:
         """Plays the episodes of an update alone."""
-        return self.with_evaluation(state, key, active, None)[0]
+        return self.with_evaluation(state, key, active, None).training
 
     def with_evaluation(
         self,
@@ -94,9 +108,8 @@ class SharedLaunch:
         key: jax.Array,
         active: bool | jax.Array,
         evaluation: EvaluationEpisodes | None,
-    ) -> tuple[Trajectory, Trajectory | None]:
+    ) -> SharedEpisodes:
         """Plays the episodes of an update, and before them those of an evaluation, if any."""
-        evaluated = []
 
         def rollout(
             env: Environment,
@@ -109,7 +122,7 @@ class SharedLaunch:
             horizon: int,
             active: bool | jax.Array,
             limit: jax.Array | None = None,
-        ) -> Trajectory:
+        ) -> SharedEpisodes:
             """Plays what the learner asks for, and the evaluation, in one launch a device."""
 
             def play(actor: Actor, keys: jax.Array, **options: Any) -> Trajectory:
@@ -127,21 +140,18 @@ class SharedLaunch:
             if self.devices is not None:
                 # The keys and the choice of the episodes are divided; all devices have the rest.
                 in_specs = NONE, NONE, NONE, RUNS, RUNS
-                out_specs = _EPISODES, evaluation_specs
+                out_specs = SharedEpisodes(_EPISODES, evaluation_specs)
                 play_share = self.devices.map(play_share, in_specs, out_specs)
             chosen = jnp.broadcast_to(active, num_episodes)
-            training_episodes, evaluation_episodes = play_share(
-                actor, evaluation_arrays, limit, keys, chosen
-            )
-            evaluated.append(evaluation_episodes)
-            return training_episodes
+            return play_share(actor, evaluation_arrays, limit, keys, chosen)
 
-        training_episodes = self.learner.play(state, key, active, rollout)
-        (evaluation_episodes,) = evaluated
-        if self.devices is not None and evaluation is not None:
-            # Those of the first device; the others played none.
-            evaluation_episodes = evaluation_episodes.episodes(slice(len(evaluation.keys)))
-        return training_episodes, evaluation_episodes
+        episodes: SharedEpisodes = self.learner.play(state, key, active, rollout)
+        if self.devices is None or evaluation is None:
+            return episodes
+        assert episodes.evaluation is not None
+        # Those of the first device; the others played none.
+        played = episodes.evaluation.episodes(slice(len(evaluation.keys)))
+        return episodes._replace(evaluation=played)
 
     def _play_share(
         self,
@@ -152,7 +162,7 @@ class SharedLaunch:
         limit: Any,
         keys: Any,
         chosen: Any,
-    ) -> tuple[Trajectory, Trajectory | None]:
+    ) -> SharedEpisodes:
         """Plays episodes of these keys, as far as they are chosen, after those of an evaluation.
 
         They have ``limit`` [] steps at most, an evaluation's those of the horizon. ``evaluation``
@@ -183,8 +193,11 @@ class SharedLaunch:
             simulated = self.devices.sum(episodes.simulated)
             episodes = dataclasses.replace(episodes, simulated=simulated)
         if evaluation is None:
-            return episodes, None
-        return episodes.episodes(slice(count, None)), episodes.episodes(slice(count))
+            return SharedEpisodes(episodes, None)
+        return SharedEpisodes(
+            training=episodes.episodes(slice(count, None)),
+            evaluation=episodes.episodes(slice(count)),
+        )
 
 
 def step_with(
@@ -195,18 +208,21 @@ def step_with(
 ) -> tuple[TrainState, Metrics, Trajectory | None]:
     """Makes one update as ``Learner.step``; also returns the episodes of the evaluation, if any."""
     launch = learner.play
-    evaluated = []
     if evaluation is None or not isinstance(launch, SharedLaunch):
         return *learner.step(state, active), None
 
-    def play(state: TrainState, key: jax.Array, active: bool | jax.Array) -> Trajectory:
-        training_episodes, evaluation_episodes = launch.with_evaluation(
-            state, key, active, evaluation
-        )
-        evaluated.append(evaluation_episodes)
-        return training_episodes
+    # ``step`` hands what ``play`` returns to ``learn``, and returns the metrics of ``learn``: the
+    # episodes of the evaluation come out among them, and nothing has learned from these.
+    def learn(
+        state: TrainState, episodes: SharedEpisodes, key: jax.Array
+    ) -> tuple[TrainState, dict[str, Any]]:
+        after, metrics = learner.learn(state, episodes.training, key)
+        return after, metrics | {_EVALUATION: episodes.evaluation}
 
-    return *learner._replace(play=play).step(state, active), *evaluated
+    play = functools.partial(launch.with_evaluation, evaluation=evaluation)
+    after, metrics = learner._replace(play=play, learn=learn).step(state, active)
+    episodes: Any = metrics.pop(_EVALUATION)
+    return after, metrics, episodes
 
 
 def short_episodes(learner: Learner, horizon: int, num_seeds: int, cut_steps: int = 0) -> Learner:
