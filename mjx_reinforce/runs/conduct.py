@@ -61,7 +61,7 @@ def conduct(
     driver = None
     for part, runs, compiled in chunks:
         config = dataclasses.replace(part.group.config, num_seeds=len(runs.seed))
-        settings = {name: values[runs.place] for name, values in part.group.settings.items()}
+        settings = {name: values[runs.member] for name, values in part.group.settings.items()}
         slots = Slots(compiled, runs.seed, settings)
         if plan.alone:
             given = config, part.ready.threshold, slots, runs, plan.found, plan.actors

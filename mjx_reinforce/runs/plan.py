@@ -120,7 +120,7 @@ def make_plan(
     if config.init_from is not None and found is None:
         actors = last_actors(config, ready.policy)
     config = dataclasses.replace(config, horizon=ready.horizon)
-    group, width = Group(config, np.zeros(1, int), {}), division.lanes(config.num_seeds)
+    group, width = Group(config, np.zeros(1, int), {}), division.capacity(config.num_seeds)
     part = Part(group, ready, config.num_seeds, width, split_runs(group, "000", 1))
     return Plan(design, [part], division, known, found, actors, clock)
 

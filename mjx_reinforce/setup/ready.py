@@ -73,7 +73,7 @@ def load_or_build_ready(
     Raises:
       ValueError: the settings do not fit the environment.
     """
-    # Programs of a sweep take settings as arguments, and are not kept on disk.
+    # Programs of a sweep take settings as arguments, and are not saved.
     key = None
     if traced is None:
         key = key_of(config)
@@ -154,7 +154,7 @@ def build_ready(
             config,
             width,
             traced or (),
-            whole=traced is None,
+            all_metrics=traced is None,
             division=division,
         )
 
@@ -174,7 +174,7 @@ _PROGRAMS = ("begin", "advance", "evaluate")
 def key_of(config: Config) -> str | None:
     """Returns a name for all that the programs of a run depend on.
 
-    None where nothing is kept: where ``Cache.find`` finds no place, and of code or a model of the
+    None where nothing is saved: where ``Cache.find`` finds no place, and of code or a model of the
     user's.
     """
     cache = Cache.find()
@@ -214,7 +214,7 @@ def save_ready(key: str, ready: Ready) -> Ready:
     del facts["programs"]
     cache = Cache.find()
     assert cache is not None  # there is a key
-    # A state of the user's own classes is no error; it is not kept.
+    # A state of the user's own classes is no error; it is not saved.
     try:
         content = {
             "facts": facts,
@@ -290,8 +290,8 @@ def describe_tree(tree: PyTree) -> Any:
             raise TypeError(f"{kind} is of another package than {', '.join(_PACKAGES)}")
         if "." in kind.__qualname__:
             raise TypeError(f"{kind} is not at the top of its module")
-        parts = {name: describe_tree(getattr(tree, name)) for name in fields}
-        return {"class": f"{kind.__module__}:{kind.__qualname__}", "fields": parts}
+        values = {name: describe_tree(getattr(tree, name)) for name in fields}
+        return {"class": f"{kind.__module__}:{kind.__qualname__}", "fields": values}
     if isinstance(tree, tuple | list):
         return {kind.__name__: [describe_tree(x) for x in tree]}
     if not hasattr(tree, "shape"):
@@ -315,12 +315,12 @@ def rebuild(described: Any) -> Any:
         module, _, name = described["class"].partition(":")
         if module.partition(".")[0] not in _PACKAGES:
             raise ValueError(f"{module} is of another package than {', '.join(_PACKAGES)}")
-        parts = {name: rebuild(x) for name, x in described["fields"].items()}
-        return getattr(importlib.import_module(module), name)(**parts)
+        values = {name: rebuild(x) for name, x in described["fields"].items()}
+        return getattr(importlib.import_module(module), name)(**values)
     if "dict" in described:
         return {name: rebuild(x) for name, x in described["dict"].items()}
-    ((kind, parts),) = described.items()
-    return {"tuple": tuple, "list": list}[kind](map(rebuild, parts))
+    ((kind, children),) = described.items()
+    return {"tuple": tuple, "list": list}[kind](map(rebuild, children))
 
 
 def _fields(tree: PyTree) -> tuple[str, ...] | None:

@@ -65,7 +65,7 @@ def _of_seed(config: Config, policy: Policy, entries: int, horizon: int) -> int:
         # Natural gradients take their steps by SGD, whatever the optimizer of the settings is.
         adam = config.optimizer == "adam" and not natural
         states = (_ADAM if adam else _SGD) * weights + _ADAM * value
-        # Vectors as long as the parameters: the gradient, those of parts of the episodes that tell
+        # Vectors as long as the parameters: the gradient, those of groups of episodes that tell
         # its noise, and the solver's. Then what the hidden layers put out for a chunk of steps.
         vectors = 1 + num_noise_episodes(config.num_episodes) + _SOLVER * natural
         samples = config.num_episodes * chunk_length(horizon, config.num_episodes)

@@ -1,7 +1,7 @@
 """How the work of a run is divided among the devices of a process.
 
 Where there are as many seeds as devices, or more, each device trains some of the seeds, and says
-nothing to the others. Where there are fewer, each plays a part of the episodes of every update of
+nothing to the others. Where there are fewer, each plays some of the episodes of every update of
 all seeds, and the sums over episodes are over all devices. Neither changes a number but by
 rounding: the keys of an episode follow from its seed and its own number.
 """
@@ -42,7 +42,7 @@ class Division:
         """Returns how many of the seeds a device has at most."""
         return -(-num_seeds // self.seeds)
 
-    def lanes(self, num_seeds: int) -> int:
+    def capacity(self, num_seeds: int) -> int:
         """Returns how many seeds all devices have room for, of so many; some stay empty."""
         return self.seeds * self.width(num_seeds)
 

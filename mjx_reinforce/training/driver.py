@@ -96,13 +96,13 @@ class Runs(NamedTuple):
     """Runs of a sweep that move on together; those of a run are its seeds.
 
     name: of these, for their files
-    place: [R] the configuration of each run, counted within its group
+    member: [R] the configuration of each run, counted within its group
     configuration: [R] the same, counted in the sweep
     seed: [R]
     """
 
     name: str
-    place: np.ndarray
+    member: np.ndarray
     configuration: np.ndarray
     seed: np.ndarray
 

@@ -245,7 +245,7 @@ class Programs(NamedTuple):
 
     begin: (seed, the numbers [R] of the runs' seeds, settings [R] each) -> the first states, and
       the data of the keys [K, R] of the last test, which plays the episodes of K evaluations
-    advance: (states, the parts of a ``Budget``, which rows have a run [R], whether to evaluate [])
+    advance: (states, the fields of a ``Budget``, which rows have a run [R], whether to evaluate [])
       -> (states, metrics [K, R] each, what was evaluated [R] each), as in ``Block``
     evaluate: (states, whether to [R]) -> what ``evaluate`` returns, [R] each
     advance_evaluates: whether ``advance`` evaluates; else ``evaluate`` does, before it
@@ -273,7 +273,7 @@ def programs_of(
     num_runs: int,
     traced: Collection[str] = (),
     *,
-    whole: bool = True,
+    all_metrics: bool = True,
     division: Division = ALONE,
 ) -> Programs:
     """Returns the programs of runs.
@@ -285,8 +285,8 @@ def programs_of(
       config: the settings, in which those that are traced stand for any value.
       num_runs: R, of the shapes; those of one device.
       traced: the names of the settings that differ from run to run.
-      whole: whether all is measured that ``metrics.csv`` has. Else evaluations play the policy's
-        mode alone, and of the metrics those of ``_COUNTED`` are returned.
+      all_metrics: whether all is measured that ``metrics.csv`` has. Else evaluations play the
+        policy's mode alone, and of the metrics those of ``_COUNTED`` are returned.
       division: among which devices the runs are divided.
     """
     learner = build_learner({})  # policies and engines are those of any
@@ -312,7 +312,7 @@ def programs_of(
         rows = layout.traced_rows(states(seed, numbers, settings))
         return rows, plain(last_test_keys(numbers, config))
 
-    size: Any = {"num_episodes": config.eval_episodes, "sampled": whole}
+    size: Any = {"num_episodes": config.eval_episodes, "sampled": all_metrics}
     make_evaluation = functools.partial(evaluation_episodes, **size)
     play = functools.partial(evaluate, env, learner, horizon=horizon, **size)
 
@@ -339,7 +339,7 @@ def programs_of(
             before, Budget(*budget), occupied & evaluation_due
         )
         # A sweep records no more, and what is returned is fetched of each of its runs.
-        if not whole:
+        if not all_metrics:
             metrics = {name: metrics[name] for name in _COUNTED}
         return layout.traced_rows(after), metrics, eval_metrics
 

@@ -185,10 +185,10 @@ def describe_nonfinite(met: np.ndarray, first_seed: int, updates: int) -> str:
     )
 
 
-def _joined(blocks: Sequence[Arrays]) -> Arrays:
-    """Returns the rows of all blocks, in order."""
-    names = blocks[0] if blocks else ()
-    return {name: np.concatenate([block[name] for block in blocks]) for name in names}
+def _joined(pieces: Sequence[Arrays]) -> Arrays:
+    """Returns the rows of all pieces of a table, in order."""
+    names = pieces[0] if pieces else ()
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
 
 
 class Record:
@@ -215,7 +215,7 @@ class Record:
         self.nonfinite = np.zeros(num_runs, np.int64)
         self.lengths = np.zeros(num_runs, np.int64)
         self.seen = np.full(num_runs, -1, np.int64)
-        #: Name -> blocks of rows: named columns, [rows, ...] each.
+        #: Name -> pieces of the table, in order: named columns, [rows, ...] each.
         self._tables: dict[str, list[Arrays]] = {"evaluations": []}
 
     def arrays(self) -> Arrays:
@@ -261,7 +261,7 @@ class Record:
         return used(self.config, self.env_steps, self.updates)
 
     def used_up(self) -> float:
-        """Returns how many whole budgets the runs have used together."""
+        """Returns how many budgets of one run the runs have used together."""
         return np.minimum(self.used(), 1.0).sum()
 
     def finished(self) -> bool:
@@ -326,8 +326,8 @@ class Record:
         Args:
           fraction: how much of their budgets they have used.
           seconds: in which they did that.
-          gained: the part of the fraction from which the time left is estimated.
-          passed: seconds in which that was gained.
+          gained: how much of the fraction was new, for an estimate of the time left.
+          passed: seconds in which that came.
         """
         env_steps_per_second = math.nan
         if seconds > 0:
@@ -379,7 +379,7 @@ class RunRecord(Record):
         self.threshold = threshold
         self.episodes = np.zeros(num_seeds, np.int64)
         self.broken_in_a_row = np.zeros(num_seeds, np.int64)
-        # Python's ints, which do not overflow: both are sums over all seeds and the whole run.
+        # Python's ints, which do not overflow: both are sums over all seeds and all updates.
         self.simulated = 0
         self.evaluated = 0
         # A run that ends before its first update has these columns without rows.
@@ -458,9 +458,9 @@ class RunRecord(Record):
     def progress(self) -> Progress:
         """Returns how far the run is, right after an evaluation."""
         names = ("env_steps", "updates", "seconds")
-        # A block of rows may be the whole past, so each is cut before they are joined, and after.
-        blocks = self._tables["evaluations"][-_LATEST:]
-        joined = _joined([{name: block[name][-_LATEST:] for name in names} for block in blocks])
+        # A piece may have one row or all of the past: each is cut, then they are joined and cut.
+        pieces = self._tables["evaluations"][-_LATEST:]
+        joined = _joined([{name: piece[name][-_LATEST:] for name in names} for piece in pieces])
         latest = {name: x[-_LATEST:] for name, x in joined.items()}
         fractions = used(self.config, latest["env_steps"], latest["updates"])
         fractions = np.minimum(fractions, 1.0).mean(axis=-1).tolist()

@@ -1,8 +1,8 @@
 """Going on: what was begun, by which program, and the checkpoints to which it goes back.
 
 A checkpoint is a run between two blocks of updates, a NumPy archive in RUN/checkpoint/. Each is
-written whole, under a name that ends in the beginning of its SHA-256: a file that was cut off or
-changed is noticed, and the one before it is used. The newest two are kept, and the newest one that
+written in full, under a name that ends in the beginning of its SHA-256: a file that was cut off or
+changed is noticed, and the one before it is used. The newest two stay, and the newest one that
 is even, for runs whose budget is raised.
 """
 
@@ -131,7 +131,7 @@ def is_done(recorded: Config, requested: Config) -> bool:
     ends = (name for name in BUDGETS if name != "checkpoint_every")
     if any(getattr(recorded, name) != getattr(requested, name) for name in ends):
         return False
-    # A crash may have left no summary, or a part of one: then the run is not done.
+    # A run without a summary, or with a damaged one, did not get to its end.
     try:
         summary = read_json(recorded.resume / "summary.json")
     except ValueError:
@@ -250,7 +250,7 @@ def read_checkpoints(folder: Path, say: Callable[[str], None]) -> Iterator[Check
       say: shows a line about each damaged file.
 
     Raises:
-      ValueError: a checkpoint is whole, but of another version of the program.
+      ValueError: a checkpoint is undamaged, but of another version of the program.
     """
     for path in _archives(folder):
         content = _read(path)
@@ -261,7 +261,7 @@ def read_checkpoints(folder: Path, say: Callable[[str], None]) -> Iterator[Check
 
 
 def remove_checkpoints(folder: Path, after: int = 0) -> None:
-    """Removes the checkpoints after a number, parts of unwritten ones, and a folder left empty."""
+    """Removes the checkpoints after a number, leftovers of writing, and a folder left empty."""
     unfinished = folder.glob(".*.npz.*")
     later = (path for path in _archives(folder) if _number(path) > after)
     for path in [*unfinished, *later]:

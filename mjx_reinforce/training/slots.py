@@ -41,17 +41,17 @@ def pack_slots(chosen: np.ndarray, lengths: np.ndarray, width: int, num_devices:
       num_devices: among which a slot is divided; each gets as many runs as the others, or one less.
 
     Returns:
-      [slots, width], the number of the run in each lane, -1 where there is none.
+      [slots, width], the number of the run in each place, -1 where there is none.
     """
     runs = np.flatnonzero(chosen)
     # A slot takes as long as its longest episode: runs of about equal lengths share one.
     runs = runs[np.argsort(lengths[runs], kind="stable")]
-    lanes = np.full((-(-len(runs) // width), width), -1)
-    lanes.flat[: len(runs)] = runs
+    slots = np.full((-(-len(runs) // width), width), -1)
+    slots.flat[: len(runs)] = runs
     # A device has a contiguous share of a slot. Runs are dealt to the devices in turn, so that the
-    # empty lanes of the last slot are not all of one device.
-    dealt = lanes.reshape(len(lanes), width // num_devices, num_devices)
-    return dealt.swapaxes(1, 2).reshape(lanes.shape)
+    # empty places of the last slot are not all of one device.
+    dealt = slots.reshape(len(slots), width // num_devices, num_devices)
+    return dealt.swapaxes(1, 2).reshape(slots.shape)
 
 
 @dataclasses.dataclass
@@ -92,7 +92,7 @@ class Compiled(NamedTuple):
 
     begin: (seed, the numbers [W] of the runs' seeds, settings [W] each) -> the first states [W, B],
       and the data of the keys [K, W] of the last test
-    advance: (states [W, B], budget, which lanes have a run [W], whether to evaluate []) -> (states
+    advance: (states [W, B], budget, which places have a run [W], whether to evaluate []) -> (states
       [W, B], metrics [K, W] each, what was evaluated [W] each, if it evaluates), as in
       ``Measured``
     evaluate: (states [W, B], which [W]) -> what ``programs.evaluate`` returns [W] each
@@ -149,7 +149,7 @@ class Slots:
             first_slots.append(compiled.begin(seed, slot_numbers, slot_settings))
         rows, keys = zip(*jax.device_get(first_slots), strict=True)
         self._rows = np.concatenate(rows)[:count]
-        #: The lanes of a slot alone, and its states after the last block.
+        #: The runs of a slot alone, and its states after the last block.
         self._placed: tuple[np.ndarray, jax.Array] | None = None
         self._test_keys = np.concatenate(keys, axis=1)[:, :count]
 
@@ -189,9 +189,9 @@ class Slots:
         Returns:
           What was measured in each block in which a run made an update.
         """
-        lanes = self._pack(chosen, lengths)
+        slots = self._pack(chosen, lengths)
         programs = self._compiled
-        num_blocks = max_blocks if len(lanes) == 1 else 1
+        num_blocks = max_blocks if len(slots) == 1 else 1
         budget = self._division.put(tuple(self.budget), NONE)
 
         def move(runs: np.ndarray) -> Any:
@@ -216,14 +216,14 @@ class Slots:
                 evaluation_due = True  # the block has changed the policies
             return states, *jax.device_get((states, blocks))
 
-        placed, rows, blocks = zip(*_side_by_side(move, lanes), strict=True)
-        for runs, slot_rows in zip(lanes, rows, strict=True):
+        placed, rows, blocks = zip(*_side_by_side(move, slots), strict=True)
+        for runs, slot_rows in zip(slots, rows, strict=True):
             self._rows[runs[runs >= 0]] = slot_rows[runs >= 0]
         # The states of a slot alone stay on the device: the next block has the same runs.
-        self._placed = (lanes[0], placed[0]) if len(lanes) == 1 else None
+        self._placed = (slots[0], placed[0]) if len(slots) == 1 else None
         # A slot has its blocks one after the other; a block is joined over its slots. Blocks after
         # the end of all runs made no update.
-        joined = [_of_slots(lanes, slots) for slots in zip(*blocks, strict=True)]
+        joined = [_of_slots(slots, block) for block in zip(*blocks, strict=True)]
         return [measured for measured in joined if measured.metrics["active"].any()]
 
     def seconds_to_evaluate(self) -> float:
@@ -236,19 +236,19 @@ class Slots:
 
     def evaluate(self) -> Measured:
         """Evaluates the present policies of all runs."""
-        lanes = self._pack()
+        slots = self._pack()
         programs = self._compiled
 
         def evaluate_slot(runs: np.ndarray) -> Any:
             occupied = self._division.put(runs >= 0)
             return {}, jax.device_get(programs.evaluate(self._put(runs), occupied))
 
-        return _of_slots(lanes, _side_by_side(evaluate_slot, lanes))
+        return _of_slots(slots, _side_by_side(evaluate_slot, slots))
 
     def test(self, actor: Actor) -> Arrays:
         """Returns what ``programs.evaluate`` does of policies [R, ...], on starts of their own.
 
-        There are ``test_episodes`` of them, rounded up to whole evaluations.
+        There are ``test_episodes`` of them, rounded up to a multiple of ``eval_episodes``.
         """
         rows = self._rows
         states = self.states()
@@ -273,8 +273,8 @@ class Slots:
             placed_runs, placed_states = self._placed
             if np.array_equal(placed_runs, runs):
                 return placed_states
-        # An empty lane, -1, has the states of the last run: some that are valid. Programs are told
-        # which lanes have a run, and what comes out of the others is left out.
+        # An empty place, -1, has the states of the last run: some that are valid. Programs are told
+        # which places have a run, and what comes out of the others is left out.
         return self._division.put(self._rows[runs])
 
     def _pack(
@@ -289,15 +289,15 @@ class Slots:
         return pack_slots(chosen, lengths, self._compiled.width, self._division.seeds)
 
 
-def _side_by_side(move: Callable[[np.ndarray], Any], lanes: np.ndarray) -> list[Any]:
+def _side_by_side(move: Callable[[np.ndarray], Any], slots: np.ndarray) -> list[Any]:
     """Returns the results for all slots [slots, width], as many at once as there are cores.
 
-    A slot alone leaves a part of the cores waiting for each other, and its results are fetched
+    A slot alone leaves some of the cores waiting for each other, and its results are fetched
     while the next one is moved.
     """
-    if len(lanes) == 1:
-        return [move(lanes[0])]
-    return list(_threads().map(move, lanes))
+    if len(slots) == 1:
+        return [move(slots[0])]
+    return list(_threads().map(move, slots))
 
 
 @functools.cache
@@ -306,14 +306,19 @@ def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(num_cores())
 
 
-def _of_slots(lanes: np.ndarray, slots: Sequence[tuple[Arrays, Arrays]]) -> Measured:
-    """Returns a block, its runs in order, from the metrics and the evaluations of its slots."""
-    runs = lanes.reshape(-1)
-    # Empty lanes, -1, are sorted to the front and cut off.
+def _of_slots(slots: np.ndarray, measured: Sequence[tuple[Arrays, Arrays]]) -> Measured:
+    """Returns a block, its runs in order, from the metrics and the evaluations of its slots.
+
+    Args:
+      slots: [slots, width] the runs of each, -1 where there is none.
+      measured: for each slot its metrics and its evaluation, [..., width] each.
+    """
+    runs = slots.reshape(-1)
+    # Empty places, -1, are sorted to the front and cut off.
     order = np.argsort(runs, kind="stable")[np.sum(runs < 0) :]
     metrics, eval_metrics = (
         {name: np.concatenate([x[name] for x in kind], axis=-1)[..., order] for name in kind[0]}
-        for kind in zip(*slots, strict=True)
+        for kind in zip(*measured, strict=True)
     )
     return Measured(runs[order], metrics, eval_metrics)
 
@@ -352,12 +357,6 @@ def compile_slots(programs: Programs, config: Config, width: int) -> Compiled:
     # Without a run: a GPU's driver translates the kernels of a program when it first runs.
     jax.block_until_ready(advance(rows, no_budget, occupied, no_evaluation))
     return Compiled(begin_task.result(), advance, evaluate, width, programs, config)
-
-
-def compile_run(programs: Programs, config: Config) -> Slots:
-    """Returns the seeds of a run before the first update, in one slot."""
-    compiled = compile_slots(programs, config, programs.division.lanes(config.num_seeds))
-    return Slots(compiled, config.first_seed + np.arange(config.num_seeds))
 
 
 def _compile_begin(programs: Programs, width: int) -> Callable[..., Any]:

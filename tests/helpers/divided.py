@@ -10,13 +10,13 @@ import sys
 
 import jax
 import numpy as np
+from one_slot import compile_run
 
 from mjx_reinforce import envs
 from mjx_reinforce.engine.base import plain
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup import build, ready
 from mjx_reinforce.training.division import ALONE, Division
-from mjx_reinforce.training.slots import compile_run
 
 SMALL = {"num_seeds": 3, "num_episodes": 8, "hidden_sizes": (4,), "eval_episodes": 2}
 SMALL |= {"env_steps": None, "max_updates": 2, "test_episodes": 4}

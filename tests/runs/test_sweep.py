@@ -502,7 +502,7 @@ def test_the_policies_of_the_best_and_the_worst_seed_are_kept(run):
         assert choose_seed(known, "best") == best
         config = Config(env="Drift-v0", num_seeds=5, eval_episodes=2, hidden_sizes=(4,))
         learner, horizon = build(env, config)
-        made = programs_of(env, lambda _, x=learner: x, horizon, config, 1, whole=False)
+        made = programs_of(env, lambda _, x=learner: x, horizon, config, 1, all_metrics=False)
         evaluate, layout = jax.jit(made.evaluate), StateRows(made.like)
         for seed in known.seeds:
             actor = jax.tree.map(lambda x: x[None], load_seed(known, seed)[0].actor)

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from one_slot import compile_run
 
 from mjx_reinforce import envs
 from mjx_reinforce.settings.config import Config
@@ -11,7 +12,6 @@ from mjx_reinforce.setup.ready import build_ready
 from mjx_reinforce.training import driver as module
 from mjx_reinforce.training.driver import Runs, begin_run
 from mjx_reinforce.training.record import HOPELESS
-from mjx_reinforce.training.slots import compile_run
 
 CONFIG = Config(
     env="ContinuousCartPole-v0",

@@ -14,6 +14,7 @@ import numpy as np
 import optax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
+from one_slot import compile_run
 from toys import Survive
 
 from mjx_reinforce import envs
@@ -25,7 +26,6 @@ from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.gpu import seam as gpu
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup import compile_times, ready
-from mjx_reinforce.training.slots import compile_run
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=4000, eval_episodes=2)
 
@@ -319,13 +319,14 @@ from mjx_reinforce import envs
 from mjx_reinforce.setup import ready
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.training.slots import compile_run
+from mjx_reinforce.training.slots import Slots, compile_slots
 configure_jax()
 if sys.argv[1] == "second":
     envs.make = None
 config = Config(env="InvertedPendulum-v5", num_seeds=2, num_episodes=2, eval_episodes=2)
 prepared = ready.load_or_build_ready(config, config)
-[(_, metrics, eval_metrics)] = compile_run(prepared.programs(), config).advance()
+slots = Slots(compile_slots(prepared.programs(), config, 2), numpy.arange(2))
+[(_, metrics, eval_metrics)] = slots.advance()
 print(prepared.engine, metrics["episode_return"].tolist(), eval_metrics["eval_return"])
 print("mujoco" in sys.modules)
 """

@@ -6,6 +6,7 @@ import functools
 import jax
 import numpy as np
 import pytest
+from one_slot import compile_run
 from toys import Toy
 
 from mjx_reinforce import envs
@@ -13,7 +14,6 @@ from mjx_reinforce.engine.base import plain
 from mjx_reinforce.learning import counts
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup import ready
-from mjx_reinforce.training.slots import compile_run
 from mjx_reinforce.training.state import seed_keys
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, eval_episodes=2)
