@@ -192,7 +192,9 @@ def _build_optimizer(config: Config, space: Box | Discrete) -> optax.GradientTra
         optimizer = optax.chain(optax.sgd(rate), optax.scale(1 / config.learning_rate))
     if config.decay_steps is None:
         return optimizer
-    length = None if config.decay_steps == "budget" else config.decay_steps
+    length = config.decay_steps
+    if length == "budget":  # as long as that, of env steps or updates
+        length = None
     # Behind the optimizer: Adam would divide a factor on its gradients out again.
     optimizer = optax.chain(optimizer, schedules.decay_rate(final_rate / rate, length))
     if config.final_std is None:

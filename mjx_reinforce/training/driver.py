@@ -384,8 +384,28 @@ def begin_run(
     return RunDriver(config, slots, RunRecord(config, threshold), runs, observers)
 
 
-#: The part of the time in which its speed is measured; what is trained in it is trained again.
-_PART = 0.03
+#: The share of the time in which its speed is measured; what is trained in it is trained again.
+_TRIAL_SHARE = 0.03
+
+
+class _Moment(NamedTuple):
+    """How far a trial is.
+
+    seconds: since its start
+    env_steps: of the mean seed, those before the trial too
+    updates: of the seed with the most, those before the trial too
+    """
+
+    seconds: float
+    env_steps: float
+    updates: int
+
+    @classmethod
+    def of(cls, seconds: float, slots: Slots) -> "_Moment":
+        """Returns how far the seeds are at this time."""
+        states = slots.states().train_states
+        env_steps = float(counts.to_int(states.env_steps).mean())
+        return cls(seconds, env_steps, int(counts.to_int(states.num_updates).max()))
 
 
 def env_steps_in(
@@ -393,8 +413,8 @@ def env_steps_in(
 ) -> int:
     """Returns the env steps that a mean seed will have played in all after a time.
 
-    The seeds are trained, and evaluated, for a small part of that time. The speed of the second
-    half of that part counts: the first updates also have what a device does once, and the shortest
+    The seeds are trained, and evaluated, for a small share of that time. The speed of the second
+    half of this trial counts: the first updates also have what a device does once, and the shortest
     episodes.
 
     Args:
@@ -403,26 +423,30 @@ def env_steps_in(
       config: the settings.
       interrupted: whether the first update of the trial is to be the last.
     """
-    most = MAX_COUNT if config.max_updates is None else config.max_updates
-    began, past = time.perf_counter(), [(0.0, *_played(slots))]
-    while past[-1][0] < _PART * seconds and not (past[1:] and interrupted()):
-        slots.budget = Budget.of(None, min(past[-1][2] + 2 ** (len(past) - 1), most))
+    max_updates = MAX_COUNT if config.max_updates is None else config.max_updates
+    start_time = time.perf_counter()
+    trial = [_Moment.of(0.0, slots)]
+    # Calls of 1, 2, 4, ... updates: nobody knows yet how long one takes, and so the last call is
+    # about half of the trial.
+    while trial[-1].seconds < _TRIAL_SHARE * seconds and not (trial[1:] and interrupted()):
+        num_updates = 2 ** (len(trial) - 1)
+        slots.budget = Budget.of(None, min(trial[-1].updates + num_updates, max_updates))
         if not slots.advance(evaluate=False):
             break  # no seed has an update left
-        past.append((time.perf_counter() - began, *_played(slots)))
-    if len(past) == 1:
-        return max(1, round(past[0][1]))
-    end, played, updates = past[-1]
-    half, before, made = next((x for x in past[1:-1] if x[0] >= end / 2), past[-2])
-    a_block = config.block_length * (end - half) / (updates - made)
-    evaluating = slots.seconds_to_evaluate()
-    speed = (played - before) / (end - half) * a_block / (a_block + evaluating)
-    left = max(seconds - end - evaluating, 0.0)
-    return min(max(1, round(past[0][1] + speed * left)), MAX_COUNT)
-
-
-def _played(slots: Slots) -> tuple[float, int]:
-    """Returns the env steps of the mean seed, and the updates of the seed with the most."""
-    states = slots.states().train_states
-    updates = counts.to_int(states.num_updates)
-    return float(counts.to_int(states.env_steps).mean()), int(updates.max())
+        trial.append(_Moment.of(time.perf_counter() - start_time, slots))
+    start = trial[0]
+    end = trial[-1]
+    if len(trial) == 1:
+        return max(1, round(start.env_steps))
+    # The last call alone, if no moment before it is in the second half.
+    halfway = next((x for x in trial[1:-1] if x.seconds >= end.seconds / 2), trial[-2])
+    elapsed = end.seconds - halfway.seconds
+    # The trial was not evaluated. The run is, after every block, and stands still meanwhile unless
+    # evaluations share the launches of updates.
+    block_seconds = config.block_length * elapsed / (end.updates - halfway.updates)
+    eval_seconds = slots.seconds_to_evaluate()
+    speed = (end.env_steps - halfway.env_steps) / elapsed
+    speed = speed * block_seconds / (block_seconds + eval_seconds)
+    # The trial took its time, and what it trained is undone: the run goes on from its start.
+    remaining = max(seconds - end.seconds - eval_seconds, 0.0)
+    return min(max(1, round(start.env_steps + speed * remaining)), MAX_COUNT)
