@@ -66,20 +66,44 @@ def block_of_updates(
       make_evaluation: (key of an evaluation [], active=whether it is made []) -> its episodes,
         which are played in one launch with those of the first update; None where learners cannot.
     """
+    update = _update_of_runs(build_learner, make_evaluation)
 
-    def active(state: RunState, budget: Budget) -> jax.Array:
-        """Returns which runs [R] have not used their budget."""
-        out_of_steps = counts.reached(state.train_states.env_steps, budget.env_steps)
-        return ~(out_of_steps | counts.reached(state.train_states.num_updates, budget.updates))
+    def advance(
+        state: RunState, budget: Budget, evaluation_due: jax.Array
+    ) -> tuple[RunState, Block]:
+        """Makes the updates, and evaluates before the first; see ``block_of_updates``."""
 
-    def progress(state: RunState, budget: Budget) -> jax.Array:
-        """Returns the share [R] of its budget that each run has used."""
-        env_steps = counts.as_float(state.train_states.env_steps)
-        updates = counts.as_float(state.train_states.num_updates)
-        # A budget of 0 would divide by 0. No run with such a budget goes on, so any share will do.
-        max_env_steps = jnp.maximum(counts.as_float(budget.env_steps), 1.0)
-        max_updates = jnp.maximum(counts.as_float(budget.updates), 1.0)
-        return jnp.minimum(jnp.maximum(env_steps / max_env_steps, updates / max_updates), 1.0)
+        def unfinished(carry: tuple[RunState, Block]) -> jax.Array:
+            state, block = carry
+            return (block.num_updates < length) & jnp.any(_active(state, budget))
+
+        def body(carry: tuple[RunState, Block]) -> tuple[RunState, Block]:
+            """Makes one update, and writes its metrics as a row."""
+            state, (num_updates, rows, eval_metrics) = carry
+            state, row, measured = update(state, budget, evaluation_due & (num_updates == 0))
+            write = functools.partial(lax.dynamic_update_index_in_dim, index=num_updates, axis=0)
+            # The first update alone evaluates; what the others return as measured is void.
+            eval_metrics = jax.tree.map(
+                lambda x, old: jnp.where(num_updates == 0, x, old), measured, eval_metrics
+            )
+            return state, Block(num_updates + 1, jax.tree.map(write, rows, row), eval_metrics)
+
+        # The loop writes into arrays of a fixed length: XLA knows no others. Rows after the last
+        # update stay zero, so that "active" is False there.
+        _, row, eval_metrics = jax.eval_shape(update, state, budget, evaluation_due)
+        zeros = functools.partial(jax.tree.map, lambda x: jnp.zeros(x.shape, x.dtype))
+        rows = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), row)
+        return lax.while_loop(
+            unfinished, body, (state, Block(jnp.int32(0), rows, zeros(eval_metrics)))
+        )
+
+    return advance
+
+
+def _update_of_runs(
+    build_learner: BuildLearner, make_evaluation: Callable[..., EvaluationEpisodes] | None
+) -> Callable[[RunState, Budget, jax.Array], Any]:
+    """Returns a function that makes one update of all runs; arguments of both as of a block."""
 
     def step(
         state: TrainState,
@@ -105,45 +129,41 @@ def block_of_updates(
     @functools.partial(jax.jit, inline=True)  # traced once, for its shapes and for the loop
     def update(state: RunState, budget: Budget, evaluation_due: jax.Array) -> Any:
         """Makes one update of all runs [R] that have budget left; results as of ``step``."""
-        # Schedules such as that of the learning rate go by the share, which only we know.
-        before = dataclasses.replace(state.train_states, progress=progress(state, budget))
-        going = active(state, budget)
+        # Schedules such as that of the learning rate go by the share, which a learner does not know.
+        before = dataclasses.replace(state.train_states, progress=_progress(state, budget))
+        going = _active(state, budget)
         evaluation_due = jnp.broadcast_to(evaluation_due, len(state.eval_keys))
         train_states, metrics, eval_metrics = jax.vmap(step)(
             before, state.settings, going, state.eval_keys, evaluation_due
         )
         return dataclasses.replace(state, train_states=train_states), metrics, eval_metrics
 
-    def advance(
-        state: RunState, budget: Budget, evaluation_due: jax.Array
-    ) -> tuple[RunState, Block]:
-        """Makes the updates, and evaluates before the first; see ``block_of_updates``."""
+    return update
 
-        def unfinished(carry: tuple[RunState, Block]) -> jax.Array:
-            state, block = carry
-            return (block.num_updates < length) & jnp.any(active(state, budget))
 
-        def body(carry: tuple[RunState, Block]) -> tuple[RunState, Block]:
-            """Makes one update, and writes its metrics as a row."""
-            state, (num_updates, rows, eval_metrics) = carry
-            state, row, measured = update(state, budget, evaluation_due & (num_updates == 0))
-            write = functools.partial(lax.dynamic_update_index_in_dim, index=num_updates, axis=0)
-            # The first update alone evaluates; what the others return as measured is void.
-            eval_metrics = jax.tree.map(
-                lambda x, old: jnp.where(num_updates == 0, x, old), measured, eval_metrics
-            )
-            return state, Block(num_updates + 1, jax.tree.map(write, rows, row), eval_metrics)
+def _active(state: RunState, budget: Budget) -> jax.Array:
+    """Returns which runs [R] have not used their budget."""
+    out_of_steps = counts.reached(state.train_states.env_steps, budget.env_steps)
+    return ~(out_of_steps | counts.reached(state.train_states.num_updates, budget.updates))
 
-        # The loop writes into arrays of a fixed length: XLA knows no others. Rows after the last
-        # update stay zero, so that "active" is False there.
-        _, row, eval_metrics = jax.eval_shape(update, state, budget, evaluation_due)
-        zeros = functools.partial(jax.tree.map, lambda x: jnp.zeros(x.shape, x.dtype))
-        rows = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), row)
-        return lax.while_loop(
-            unfinished, body, (state, Block(jnp.int32(0), rows, zeros(eval_metrics)))
-        )
 
-    return advance
+def _progress(state: RunState, budget: Budget) -> jax.Array:
+    """Returns the share [R] of its budget that each run has used."""
+    env_steps = counts.as_float(state.train_states.env_steps)
+    updates = counts.as_float(state.train_states.num_updates)
+    # A budget of 0 would divide by 0. No run with such a budget goes on, so any share will do.
+    max_env_steps = jnp.maximum(counts.as_float(budget.env_steps), 1.0)
+    max_updates = jnp.maximum(counts.as_float(budget.updates), 1.0)
+    return jnp.minimum(jnp.maximum(env_steps / max_env_steps, updates / max_updates), 1.0)
+
+
+def _stop_empty(state: RunState, occupied: jax.Array) -> RunState:
+    """Returns states [R] in which those without a run, not ``occupied`` [R], stand still."""
+    # They count as runs whose budget is used, for which a block of updates does not wait.
+    env_steps = state.train_states.env_steps
+    env_steps = jnp.where(occupied[:, None], env_steps, counts.from_int(MAX_COUNT))
+    train_states = dataclasses.replace(state.train_states, env_steps=env_steps)
+    return dataclasses.replace(state, train_states=train_states)
 
 
 def evaluation_episodes(
@@ -265,6 +285,25 @@ class Programs(NamedTuple):
 _COUNTED = ("active", "env_steps", "nonfinite_episodes", "skipped_update")
 
 
+def _states_of_runs(build_learner: BuildLearner) -> Callable[..., RunState]:
+    """Returns a function of a root, the seeds' numbers [R] and the settings [R] of runs."""
+
+    def first_state(key: jax.Array, settings: dict[str, jax.Array]) -> TrainState:
+        return build_learner(settings).init(key)
+
+    # One program, whatever the seeds are: a program for each operation on keys takes longer.
+    def states(seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]) -> RunState:
+        """Returns the states of R runs before their first update."""
+        keys = seed_keys(seed, numbers)
+        return RunState(
+            train_states=jax.vmap(first_state)(keys, settings),
+            eval_keys=eval_keys(numbers),
+            settings=settings,
+        )
+
+    return states
+
+
 def programs_of(
     env: Environment,
     build_learner: BuildLearner,
@@ -295,18 +334,7 @@ def programs_of(
         isinstance(learner.play, SharedLaunch) and config.training_horizon(horizon) == horizon
     )
 
-    def first_state(key: jax.Array, settings: dict[str, jax.Array]) -> TrainState:
-        return build_learner(settings).init(key)
-
-    # One program, whatever the seeds are: a program for each operation on keys takes longer.
-    def states(seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]) -> RunState:
-        """Returns the states of R runs before their first update."""
-        keys = seed_keys(seed, numbers)
-        return RunState(
-            train_states=jax.vmap(first_state)(keys, settings),
-            eval_keys=eval_keys(numbers),
-            settings=settings,
-        )
+    states = _states_of_runs(build_learner)
 
     def begin(seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]) -> Any:
         rows = layout.traced_rows(states(seed, numbers, settings))
@@ -328,13 +356,7 @@ def programs_of(
         rows: jax.Array, budget: Sequence[jax.Array], occupied: jax.Array, evaluation_due: jax.Array
     ) -> Any:
         """Makes a block of updates of rows; those without a run are not ``occupied`` [R]."""
-        before = layout.traced_states(rows)
-        # A row without a run counts as one whose budget is used: it stands still, and the block
-        # ends without waiting for it.
-        env_steps = before.train_states.env_steps
-        env_steps = jnp.where(occupied[:, None], env_steps, counts.from_int(MAX_COUNT))
-        train_states = dataclasses.replace(before.train_states, env_steps=env_steps)
-        before = dataclasses.replace(before, train_states=train_states)
+        before = _stop_empty(layout.traced_states(rows), occupied)
         after, (_, metrics, eval_metrics) = updates(
             before, Budget(*budget), occupied & evaluation_due
         )
