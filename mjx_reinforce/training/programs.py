@@ -129,7 +129,7 @@ def _update_of_runs(
     @functools.partial(jax.jit, inline=True)  # traced once, for its shapes and for the loop
     def update(state: RunState, budget: Budget, evaluation_due: jax.Array) -> Any:
         """Makes one update of all runs [R] that have budget left; results as of ``step``."""
-        # Schedules such as that of the learning rate go by the share, which a learner does not know.
+        # Schedules, such as the learning rate's, go by a share that learners do not know.
         before = dataclasses.replace(state.train_states, progress=_progress(state, budget))
         going = _active(state, budget)
         evaluation_due = jnp.broadcast_to(evaluation_due, len(state.eval_keys))
