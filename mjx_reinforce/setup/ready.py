@@ -254,13 +254,16 @@ def load_ready(key: str, division: Division = ALONE) -> Ready | None:
     if text is None:
         return None
     # A crash may have left some of them, and one that JAX could not export is never there.
-    loaded: list[Any] = [cache.load(f"{key}-{name}") for name in _PROGRAMS]
-    if any(program is None for program in loaded):
+    loaded_programs: list[Any] = [cache.load(f"{key}-{name}") for name in _PROGRAMS]
+    if any(program is None for program in loaded_programs):
         return None
     content = json.loads(text)
     like = rebuild(content["like"])
     programs = Programs(
-        *loaded, advance_evaluates=content["advance_evaluates"], like=like, division=division
+        *loaded_programs,
+        advance_evaluates=content["advance_evaluates"],
+        like=like,
+        division=division,
     )
     return Ready(**content["facts"], programs=lambda: programs)
 
@@ -299,27 +302,27 @@ def describe_tree(tree: PyTree) -> Any:
     return {"leaf": "key" if is_key(tree) else np.dtype(tree.dtype).name, "shape": list(tree.shape)}
 
 
-def rebuild(described: Any) -> Any:
+def rebuild(description: Any) -> Any:
     """Returns the pytree of ``describe_tree``; its leaves are ``jax.ShapeDtypeStruct``.
 
     Raises:
       ValueError, KeyError, TypeError, AttributeError or ImportError: it is no such description.
     """
-    if described is None:
+    if description is None:
         return None
-    if "leaf" in described:
-        kind = described["leaf"]
+    if "leaf" in description:
+        kind = description["leaf"]
         dtype = jax.eval_shape(jax.random.key, 0).dtype if kind == "key" else np.dtype(kind)
-        return jax.ShapeDtypeStruct(tuple(described["shape"]), dtype)
-    if "class" in described:
-        module, _, name = described["class"].partition(":")
+        return jax.ShapeDtypeStruct(tuple(description["shape"]), dtype)
+    if "class" in description:
+        module, _, name = description["class"].partition(":")
         if module.partition(".")[0] not in _PACKAGES:
             raise ValueError(f"{module} is of another package than {', '.join(_PACKAGES)}")
-        values = {name: rebuild(x) for name, x in described["fields"].items()}
+        values = {name: rebuild(x) for name, x in description["fields"].items()}
         return getattr(importlib.import_module(module), name)(**values)
-    if "dict" in described:
-        return {name: rebuild(x) for name, x in described["dict"].items()}
-    ((kind, children),) = described.items()
+    if "dict" in description:
+        return {name: rebuild(x) for name, x in description["dict"].items()}
+    ((kind, children),) = description.items()
     return {"tuple": tuple, "list": list}[kind](map(rebuild, children))
 
 

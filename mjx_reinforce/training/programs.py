@@ -108,7 +108,7 @@ def _update_of_runs(
     def step(
         state: TrainState,
         settings: dict[str, jax.Array],
-        going: jax.Array,
+        active: jax.Array,
         eval_key: jax.Array,
         evaluation_due: jax.Array,
     ) -> Any:
@@ -119,22 +119,22 @@ def _update_of_runs(
         evaluation = None
         if make_evaluation is not None:
             evaluation = make_evaluation(eval_key, active=evaluation_due)
-        state, metrics, trajectory = step_with(build_learner(settings), state, going, evaluation)
+        state, metrics, trajectory = step_with(build_learner(settings), state, active, evaluation)
         eval_metrics = {}
         # Without a shared launch there are no episodes of the evaluation.
         if evaluation is not None and trajectory is not None:
             eval_metrics = evaluation_metrics(trajectory, evaluation)
-        return state, metrics | {"active": going}, eval_metrics
+        return state, metrics | {"active": active}, eval_metrics
 
     @functools.partial(jax.jit, inline=True)  # traced once, for its shapes and for the loop
     def update(state: RunState, budget: Budget, evaluation_due: jax.Array) -> Any:
         """Makes one update of all runs [R] that have budget left; results as of ``step``."""
         # Schedules, such as the learning rate's, go by a share that learners do not know.
         before = dataclasses.replace(state.train_states, progress=_progress(state, budget))
-        going = _active(state, budget)
+        active = _active(state, budget)
         evaluation_due = jnp.broadcast_to(evaluation_due, len(state.eval_keys))
         train_states, metrics, eval_metrics = jax.vmap(step)(
-            before, state.settings, going, state.eval_keys, evaluation_due
+            before, state.settings, active, state.eval_keys, evaluation_due
         )
         return dataclasses.replace(state, train_states=train_states), metrics, eval_metrics
 

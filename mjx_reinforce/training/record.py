@@ -64,8 +64,8 @@ def as_rows(measured: Arrays, seconds: float) -> Arrays:
       seconds: wall time since compilation ended.
     """
     clock = np.full(len(measured["seed"]), round(seconds, 3))
-    named = {column: measured.get(_RENAMED.get(column, column)) for column in COLUMNS}
-    return {n: x for n, x in named.items() if x is not None} | {"wall_seconds": clock}
+    columns = {column: measured.get(_RENAMED.get(column, column)) for column in COLUMNS}
+    return {n: x for n, x in columns.items() if x is not None} | {"wall_seconds": clock}
 
 
 def lines(rows: Arrays) -> bytes:
@@ -173,12 +173,12 @@ def describe_nonfinite(met: np.ndarray, first_seed: int, updates: int) -> str:
       updates: how many there were after the block.
     """
     seeds = (first_seed + np.flatnonzero(met)).tolist()
-    named = ", ".join(map(str, seeds[:_NAMED]))
+    numbers = ", ".join(map(str, seeds[:_NAMED]))
     if len(seeds) > _NAMED:
-        named += ", ..."
-    numbers = "number" if len(seeds) == 1 else "numbers"
+        numbers += ", ..."
+    noun = "number" if len(seeds) == 1 else "numbers"
     return (
-        f"up to update {updates}, {len(seeds):,} of {len(met):,} seeds ({numbers} {named}) met "
+        f"up to update {updates}, {len(seeds):,} of {len(met):,} seeds ({noun} {numbers}) met "
         "values that are not finite or beyond 1e10. Such an episode counts as the worst of its "
         "update. This line comes once; the number of such updates comes at the end. If they are "
         "many, give the model a smaller timestep or more armature, or lower --learning-rate"

@@ -161,9 +161,9 @@ def check_same_program(
             new = _without_devices(new)
         # Of versions and JAX's settings the message names the first one that differs.
         if isinstance(old, dict) and isinstance(new, dict):
-            changed = [key for key in {**old, **new} if old.get(key) != new.get(key)]
-            if changed:
-                name = changed[0]
+            changed_keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+            if changed_keys:
+                name = changed_keys[0]
                 old = old.get(name)
                 new = new.get(name)
         if old != new:
@@ -236,9 +236,9 @@ def save(folder: Path, checkpoint: Checkpoint, *, even: bool) -> None:
     write_bytes(folder / name, content)
     # Two, in case the newest one is damaged. The even one is what a larger budget goes on from.
     paths = _archives(folder)
-    needed = paths[:_NUM_NEWEST] + [path for path in paths if "-even-" in path.name][:1]
+    live_paths = paths[:_NUM_NEWEST] + [path for path in paths if "-even-" in path.name][:1]
     for path in paths:
-        if path not in needed:
+        if path not in live_paths:
             path.unlink()
 
 
@@ -378,13 +378,13 @@ def _serves(checkpoint: Checkpoint, config: Config) -> bool:
     """
     if (checkpoint.env_steps, checkpoint.max_updates) == (config.env_steps, config.max_updates):
         return True
-    for name, budget, used in (
+    for name, budget, minimum in (
         ("env_steps", config.env_steps, checkpoint.record["env_steps"].max()),
         ("max_updates", config.max_updates, checkpoint.record["updates"].max()),
     ):
-        if budget is not None and budget < used:
+        if budget is not None and budget < minimum:
             raise ValueError(
-                f"{flag(name)} {budget} is less than the {used} of the run so far; give at least "
-                "that"
+                f"{flag(name)} {budget} is less than the {minimum} of the run so far; give at "
+                "least that"
             )
     return config.minutes is not None or checkpoint.is_even(config.eval_every)

@@ -50,8 +50,8 @@ def pack_slots(chosen: np.ndarray, lengths: np.ndarray, width: int, num_devices:
     slots.flat[: len(runs)] = runs
     # A device has a contiguous share of a slot. Runs are dealt to the devices in turn, so that the
     # empty places of the last slot are not all of one device.
-    dealt = slots.reshape(len(slots), width // num_devices, num_devices)
-    return dealt.swapaxes(1, 2).reshape(slots.shape)
+    by_device = slots.reshape(len(slots), width // num_devices, num_devices)
+    return by_device.swapaxes(1, 2).reshape(slots.shape)
 
 
 @dataclasses.dataclass
@@ -261,11 +261,11 @@ class Slots:
             evaluations.append(self.evaluate().eval_metrics)
         self._rows = rows
         self._placed = None
-        tested = {}
+        test_metrics = {}
         for name in evaluations[0]:
             average = np.sum if name.endswith("steps") else np.mean
-            tested[name] = average([evaluation[name] for evaluation in evaluations], axis=0)
-        return tested
+            test_metrics[name] = average([evaluation[name] for evaluation in evaluations], axis=0)
+        return test_metrics
 
     def _put(self, runs: np.ndarray) -> jax.Array:
         """Returns the states of a slot's runs, on the device."""

@@ -226,18 +226,18 @@ def last_actors(config: Config, policy: Mapping[str, Any]) -> Actor:
     assert config.init_from is not None
     directory = Path(config.init_from)
     run = read_run(directory)
-    saved = read_policy(policy_folder(run, "last"), own=config.policy)
+    source = read_policy(policy_folder(run, "last"), own=config.policy)
     # Parameters fit only the network, the family and the spaces for which they were trained.
     for name, value in policy.items():
-        old = saved.settings.get(name, value)
+        old = source.settings.get(name, value)
         if name not in _DRAWN and old != value:
             raise ValueError(
                 f"the policies in {directory}, trained on {run.env}, have {name} {old}, and this "
                 f"run {value}; make them agree, or leave --init-from out"
             )
     # A run with more seeds than that one begins with some of its policies several times.
-    seeds = (config.first_seed + np.arange(config.num_seeds)) % saved.num_seeds
-    return jax.tree.map(lambda x: x[seeds], saved.actor)
+    seeds = (config.first_seed + np.arange(config.num_seeds)) % source.num_seeds
+    return jax.tree.map(lambda x: x[seeds], source.actor)
 
 
 def begin_with(state: RunState, actors: Actor) -> RunState:

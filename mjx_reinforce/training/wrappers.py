@@ -150,8 +150,8 @@ class SharedLaunch:
             return episodes
         assert episodes.evaluation is not None
         # Those of the first device; the others played none.
-        played = episodes.evaluation.episodes(slice(len(evaluation.keys)))
-        return episodes._replace(evaluation=played)
+        evaluation_episodes = episodes.evaluation.episodes(slice(len(evaluation.keys)))
+        return episodes._replace(evaluation=evaluation_episodes)
 
     def _play_share(
         self,
