@@ -74,7 +74,7 @@ class Learner(NamedTuple):
       init: (key) -> TrainState; consumes the key
       play: (TrainState, key, active) -> what is played for one update, a ``Trajectory`` of N fresh
         episodes or a pytree that holds one; nothing where ``active`` [] is False; consumes the key.
-        That of ``reinforce`` also takes a rollout in place of the engine's
+        That of ``reinforce`` also takes a rollout in place of the engine's, see ``RolloutPlay``
       learn: (TrainState, what was played, key) -> (TrainState, metrics), with the actor and all
         else that changes by learning; consumes the key
       policy: the policy that is trained; its mode is clipped to the action space
@@ -237,7 +237,27 @@ def reinforce(
         normalize_min_std=normalize_min_std,
         engine=choice.choose(engine, env, acting, horizon),
     )
-    return Learner(parts.init, parts.play, parts.learn, policy, parts.engine)
+    return Learner(parts.init, RolloutPlay(parts.play), parts.learn, policy, parts.engine)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RolloutPlay:
+    """A ``Learner.play`` that also takes a rollout in place of the engine's.
+
+    It returns what that rollout returns, of whatever type.
+    """
+
+    function: Callable[..., Any]
+
+    def __call__(
+        self,
+        state: TrainState,
+        key: jax.Array,
+        active: bool | jax.Array = True,
+        rollout: Rollout | None = None,
+    ) -> Any:
+        """Plays for one update."""
+        return self.function(state, key, active, rollout)
 
 
 def first_actor(policy: Policy, observation_size: int, key: jax.Array) -> Actor:

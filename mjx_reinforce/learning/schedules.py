@@ -6,7 +6,6 @@ keeps its rate and its noise, and one that has learned to play long ones settles
 """
 
 import functools
-import inspect
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +14,7 @@ import optax
 from jax.typing import ArrayLike
 
 from mjx_reinforce.engine.checks import check_count, check_number
+from mjx_reinforce.learning.learner import RolloutPlay
 from mjx_reinforce.learning.updates import Clock
 
 #: The standard deviation shrinks in so many steps. Each is far greater than float32's rounding of
@@ -52,8 +52,8 @@ class Cut(NamedTuple):
           ValueError: a number makes no sense, or ``reinforce`` did not make the learner.
         """
         # Only the ``play`` of ``reinforce`` takes a rollout, to which a limit can be given.
-        play_whole: Any = getattr(learner, "play", lambda: None)
-        if "rollout" not in inspect.signature(play_whole).parameters:
+        play_whole = getattr(learner, "play", None)
+        if not isinstance(play_whole, RolloutPlay):
             raise ValueError(f"a cut takes a learner of mjx_reinforce.reinforce, got {learner!r}")
         check_count("cut.steps", self.steps)
         check_number("cut.until", self.until)
@@ -65,7 +65,7 @@ class Cut(NamedTuple):
             cut_rollout = functools.partial(full_rollout, limit=self.limit(state.progress))
             return play_whole(state, key, active, cut_rollout)
 
-        return learner._replace(play=play)
+        return learner._replace(play=RolloutPlay(play))
 
     def limit(self, progress: jax.Array) -> jax.Array:
         """Returns the most steps [] of an episode where this share [] of the budget is used."""

@@ -12,6 +12,7 @@ import jax
 import optax
 
 import mjx_reinforce as mr
+from mjx_reinforce.learning.learner import RolloutPlay
 
 
 def reward_to_go(env: mr.Environment, config: Any, **shared: Any) -> mr.Learner:
@@ -61,7 +62,7 @@ def with_one_start(learner: mr.Learner) -> mr.Learner:
 
         return learner.play(state, key, active, from_one_start)
 
-    return learner._replace(init=init, play=play)
+    return learner._replace(init=init, play=RolloutPlay(play))
 
 
 class _OneStart:

@@ -12,7 +12,7 @@ from mjx_reinforce.runs.display import Display, SweepScreen
 from mjx_reinforce.runs.plan import GroupPlan, Plan
 from mjx_reinforce.runs.saving import Files
 from mjx_reinforce.setup.compile_times import keep_seconds
-from mjx_reinforce.training.driver import Driver, Observer, Runs, Training, begin_run
+from mjx_reinforce.training.driver import Driver, Observer, RunDriver, Runs, begin_run
 from mjx_reinforce.training.record import Record
 from mjx_reinforce.training.slots import Compiled, Slots, Stopwatch, compile_slots, started
 
@@ -23,7 +23,7 @@ def conduct(
     display: Display,
     observers: Sequence[Observer[Any]],
     interrupt: Interrupt,
-) -> tuple[Training | None, dict[str, Any]]:
+) -> tuple[Driver | None, dict[str, Any]]:
     """Trains the chunks that have not ended yet, to their end or until they are interrupted.
 
     Args:
@@ -78,7 +78,7 @@ def conduct(
         assert files is not None
         summary = _sweep_summary(files.contents, driver, clock)
     else:
-        assert isinstance(driver, Driver)
+        assert isinstance(driver, RunDriver)
         # A signal after that changes nothing: what is left takes a second or two.
         test = driver.test(interrupt.heard)
         summary = driver.summary(plan.group_plans[0].ready.engine, clock.compiling, test)
@@ -106,7 +106,7 @@ def _begin(
     say: Callable[[str], None],
     observers: Sequence[Observer[Any]],
     interrupted: Callable[[], bool],
-) -> Training:
+) -> Driver:
     """Returns the runs of a chunk before their first update.
 
     Args:
@@ -121,10 +121,10 @@ def _begin(
     group = group_plan.group
     # The number of seeds is here that of the chunk's runs, whatever configuration each is of.
     config = dataclasses.replace(group.config, num_seeds=len(runs.seed))
-    settings = {name: values[runs.place] for name, values in group.settings.items()}
+    settings = {name: values[runs.member] for name, values in group.settings.items()}
     slots = Slots(compiled, runs.seed, settings)
     if plan.design.is_sweep:
-        return Training(config, slots, Record(config), runs, observers=observers)
+        return Driver(config, slots, Record(config), runs, observers=observers)
     return begin_run(
         config,
         group_plan.ready.threshold,
@@ -139,7 +139,7 @@ def _begin(
 
 
 def _sweep_summary(
-    contents: Mapping[str, Any], driver: Training | None, clock: Stopwatch
+    contents: Mapping[str, Any], driver: Driver | None, clock: Stopwatch
 ) -> dict[str, Any]:
     """Returns the contents of sweep.json at the end.
 

@@ -21,7 +21,7 @@ from mjx_reinforce.reports.experiment import counted, say, setting_in_words
 from mjx_reinforce.runs.plan import GroupPlan, Plan
 from mjx_reinforce.statistics import enough, iqm
 from mjx_reinforce.training import record
-from mjx_reinforce.training.driver import Driver, Evaluation, Observer, Training
+from mjx_reinforce.training.driver import Driver, Evaluation, Observer, RunDriver
 
 
 class _Bar(Progress):
@@ -44,7 +44,7 @@ class _Screen(Console):
         self.quiet = True
 
 
-class Display(Observer[Driver]):
+class Display(Observer[RunDriver]):
     """A progress bar on a terminal, one line an evaluation elsewhere."""
 
     def __init__(self, *, quiet: bool = False):
@@ -157,19 +157,19 @@ class Display(Observer[Driver]):
                 f"{returns_and_speed}  {percent}  {time_left}".rstrip()
             )
 
-    def updated(self, driver: Driver, met: np.ndarray) -> None:
+    def updated(self, driver: RunDriver, met: np.ndarray) -> None:
         """Says once which seeds met numbers that are not finite; the last table counts them."""
         if met.any() and not self._nonfinite_shown:
             self._nonfinite_shown = True
             text = record.describe_nonfinite(met, driver.config.first_seed, driver.updates())
             self.say(text, "yellow")
 
-    def evaluated(self, driver: Driver, evaluation: Evaluation, rows: Arrays) -> None:
+    def evaluated(self, driver: RunDriver, evaluation: Evaluation, rows: Arrays) -> None:
         """Shows how far the run is and how well it does."""
         self.show_progress(driver.record.progress())
 
 
-class SweepScreen(Observer[Training]):
+class SweepScreen(Observer[Driver]):
     """Shows how far a sweep is, and which of its runs are trained."""
 
     def __init__(self, display: Display, plan: Plan, group_plans: Iterable[GroupPlan]):
@@ -184,7 +184,7 @@ class SweepScreen(Observer[Training]):
             len(runs.seed) for group_plan in group_plans for runs in group_plan.chunks
         )
 
-    def began(self, driver: Training) -> None:
+    def began(self, driver: Driver) -> None:
         """Says which configurations the lines that follow are of."""
         # The files came first, and restored a checkpoint if there was one: until now nothing of
         # this chunk was trained by this process.
@@ -202,7 +202,7 @@ class SweepScreen(Observer[Training]):
         count = f"{counted(len(in_chunk), 'configuration')} of {len(configurations):,}"
         self._display.say(f"{'; '.join(settings)} ({count}, {counted(len(runs.seed), 'run')})")
 
-    def updated(self, driver: Training, met: np.ndarray) -> None:
+    def updated(self, driver: Driver, met: np.ndarray) -> None:
         """Shows how far it is."""
         budgets = self._num_ended + driver.record.used_up()
         fraction = float(budgets / self._num_runs)
@@ -210,10 +210,10 @@ class SweepScreen(Observer[Training]):
         # took is in no clock of it.
         gained = float(budgets - self._budgets_before) / self._num_runs
         running = self._plan.clock.running()
-        progress = driver.record.measure(fraction, driver.seconds(), gained, running)
+        progress = driver.record.progress_at(fraction, driver.seconds(), gained, running)
         self._display.show_progress(progress)
 
-    def ended(self, driver: Training) -> None:
+    def ended(self, driver: Driver) -> None:
         """Counts the runs."""
         self._num_ended += len(driver.runs.seed)
 

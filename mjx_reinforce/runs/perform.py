@@ -32,7 +32,7 @@ from mjx_reinforce.training.resume import read_record
 if TYPE_CHECKING:
     from mjx_reinforce.report import WrittenReport
     from mjx_reinforce.runs.display import Display
-    from mjx_reinforce.training.driver import Observer, Training
+    from mjx_reinforce.training.driver import Driver, Observer
 
 #: What a kill leaves of the first file of a run or a sweep, which then was not begun.
 _FIRST = (".config.json.", ".sweep.json.")
@@ -177,7 +177,7 @@ class Outcome(NamedTuple):
     design: Design
     directory: Path | None
     summary: dict[str, Any]
-    driver: "Training | None"
+    driver: "Driver | None"
     policy: dict[str, Any]
     display: "Display"
 

@@ -22,7 +22,7 @@ from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.defaults import num_cores
 from mjx_reinforce.settings.groups import Reader
 from mjx_reinforce.setup.provenance import provenance
-from mjx_reinforce.setup.ready import Ready, get_ready
+from mjx_reinforce.setup.ready import Ready, load_or_build_ready
 from mjx_reinforce.training import resume
 from mjx_reinforce.training.division import Division
 from mjx_reinforce.training.driver import Runs
@@ -116,7 +116,7 @@ def make_plan(
     if config.resume is not None:
         checkpoint = resume.newest_checkpoint(config, say)
     division = divide_run(config)
-    ready = get_ready(config, design.default or config, env, division)
+    ready = load_or_build_ready(config, design.default or config, env, division)
     actors = None
     # The policies of a checkpoint began with those of the other run, and have learned since.
     if config.init_from is not None and checkpoint is None:
@@ -129,7 +129,7 @@ def make_plan(
         group=group,
         ready=ready,
         limit=config.num_seeds,
-        width=division.lanes(config.num_seeds),
+        width=division.capacity(config.num_seeds),
         chunks=split_runs(group, "000", 1),
     )
     return Plan(design, [group_plan], division, saved_record, checkpoint, actors, clock)
@@ -198,7 +198,9 @@ def _plan_sweep(
         chosen_names = vars(config).keys() & {*design.chosen_names, *design.over}
         unset = {name: None for name in chosen_names if is_read(name, config)}
         default: Any = dataclasses.replace(config, **unset)
-        ready = get_ready(config, default, division=division, traced=tuple(group.settings))
+        ready = load_or_build_ready(
+            config, default, division=division, traced=tuple(group.settings)
+        )
         # A sweep that goes on has the chunks that it had, by whose names their files are found,
         # whatever memory there is here.
         if saved_record:

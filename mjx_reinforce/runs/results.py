@@ -21,17 +21,17 @@ from mjx_reinforce.runs.design import Design, check_swept
 from mjx_reinforce.runs.perform import perform, report_on
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import worst_if_not_finite
-from mjx_reinforce.training.driver import Driver, Evaluation, Observer
+from mjx_reinforce.training.driver import Evaluation, Observer, RunDriver
 
 
-class Callbacks(Observer[Driver]):
+class Callbacks(Observer[RunDriver]):
     """A user's own functions, called with each ``Evaluation``; one that returns true ends it."""
 
     def __init__(self, functions: Sequence[Callable[[Evaluation], Any]]):
         """Takes the functions."""
         self._functions = functions
 
-    def evaluated(self, driver: Driver, evaluation: Evaluation, rows: Arrays) -> None:
+    def evaluated(self, driver: RunDriver, evaluation: Evaluation, rows: Arrays) -> None:
         """Calls the functions."""
         for function in self._functions:
             if function(evaluation):
@@ -155,7 +155,7 @@ def run(
     )
     driver = outcome.driver
     summary = outcome.summary
-    assert isinstance(driver, Driver)
+    assert isinstance(driver, RunDriver)
     history = driver.record.history()
     return RunResults(
         config=driver.config,

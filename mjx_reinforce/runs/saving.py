@@ -37,7 +37,7 @@ from mjx_reinforce.runs.sinks import Sink, open_sinks
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup.provenance import provenance
 from mjx_reinforce.training import resume
-from mjx_reinforce.training.driver import Driver, Evaluation, Observer, Seen, Training
+from mjx_reinforce.training.driver import Driver, DriverT, Evaluation, Observer, RunDriver
 from mjx_reinforce.training.record import HEADER, lines
 from mjx_reinforce.training.resume import Checkpoint
 
@@ -45,7 +45,7 @@ from mjx_reinforce.training.resume import Checkpoint
 _CHECKPOINT_SECONDS = 60.0
 
 
-class Files(Observer[Seen]):
+class Files(Observer[DriverT]):
     """The files of a run or a sweep, all but the first and the last of which may fail.
 
     What cannot be written while runs go on is a warning, and is tried again. A directory that was
@@ -90,7 +90,7 @@ class Files(Observer[Seen]):
         """Returns whether the runs of this name have ended."""
         return False
 
-    def updated(self, driver: Seen, met: np.ndarray) -> None:
+    def updated(self, driver: DriverT, met: np.ndarray) -> None:
         """Saves if that is due; the last block is saved with its evaluation, by ``ended``."""
         self._check_place()
         self._saved = False
@@ -102,7 +102,7 @@ class Files(Observer[Seen]):
         if due and not driver.record.finished():
             self._save(driver)
 
-    def ended(self, driver: Seen) -> None:
+    def ended(self, driver: DriverT) -> None:
         """Saves the last state, unless it is saved; nobody tries again."""
         self._prospect = ""
         # Without what has failed before, so that a failure now is shown, too.
@@ -110,25 +110,25 @@ class Files(Observer[Seen]):
         if not self._saved:
             self._save(driver)
 
-    def _go_on(self, driver: Seen, checkpoint: Checkpoint | None) -> None:
+    def _go_on(self, driver: DriverT, checkpoint: Checkpoint | None) -> None:
         """Takes runs to a checkpoint, if there is one, from where the next is due."""
         if checkpoint is not None:
             driver.restore(checkpoint)
         self._saved = checkpoint is not None
         self._mark_saved(driver)
 
-    def _mark_saved(self, driver: Seen) -> None:
+    def _mark_saved(self, driver: DriverT) -> None:
         """Counts from now, and from these updates, to the next checkpoint."""
         self._saved_at = time.perf_counter()
         self._saved_updates = driver.updates()
 
-    def _save(self, driver: Seen) -> None:
+    def _save(self, driver: DriverT) -> None:
         """Writes a checkpoint, in case the runs are killed."""
         # Also where it fails: the next is tried no sooner than if it had not.
         self._mark_saved(driver)
         self._saved = self._attempt("a checkpoint", lambda: self._save_checkpoint(driver))
 
-    def _save_checkpoint(self, driver: Seen) -> None:
+    def _save_checkpoint(self, driver: DriverT) -> None:
         """Writes a checkpoint, or raises OSError."""
         raise NotImplementedError
 
@@ -171,7 +171,7 @@ class Files(Observer[Seen]):
         write_json(self._directory / name, content)
 
 
-class RunFiles(Files[Driver]):
+class RunFiles(Files[RunDriver]):
     """Writes the files of a run, and the rows of its sinks."""
 
     _folders = ("policy", "policy/best", "wandb")
@@ -186,7 +186,7 @@ class RunFiles(Files[Driver]):
         #: Where rows go besides metrics.csv.
         self._sinks: list[Sink] = []
 
-    def began(self, driver: Driver) -> None:
+    def began(self, driver: RunDriver) -> None:
         """Writes the first files, or takes the run and its files back to where it goes on.
 
         Raises:
@@ -214,7 +214,7 @@ class RunFiles(Files[Driver]):
         self._write_json("config.json", settings | provenance())
         write_bytes(self._metrics, HEADER)
 
-    def _take_back(self, driver: Driver, checkpoint: Checkpoint | None) -> None:
+    def _take_back(self, driver: RunDriver, checkpoint: Checkpoint | None) -> None:
         """Takes the files back to a checkpoint, and says in config.json that the run goes on.
 
         A crash in between leaves a run that can be resumed: config.json is first, so that the
@@ -236,7 +236,7 @@ class RunFiles(Files[Driver]):
             resume.remove_checkpoints(self._checkpoints, after=checkpoint.number)
             files.cut(self._metrics, checkpoint.metrics_bytes)
 
-    def evaluated(self, driver: Driver, evaluation: Evaluation, rows: Arrays) -> None:
+    def evaluated(self, driver: RunDriver, evaluation: Evaluation, rows: Arrays) -> None:
         """Writes the rows of an evaluation."""
         # Together with what a full disk did not take before, so that no row is lost.
         self._waiting += lines(rows)
@@ -244,7 +244,7 @@ class RunFiles(Files[Driver]):
         for sink in self._sinks:
             self._attempt(sink.name, functools.partial(sink.write, rows))
 
-    def finished(self, driver: Driver, summary: dict[str, Any]) -> None:
+    def finished(self, driver: RunDriver, summary: dict[str, Any]) -> None:
         """Writes the last files, summary.json last of all, or raises OSError."""
         self._check_place()
         self._save_policies(driver)
@@ -257,7 +257,7 @@ class RunFiles(Files[Driver]):
         for sink in self._sinks:
             self._attempt(sink.name, sink.close)
 
-    def _save(self, driver: Driver) -> None:
+    def _save(self, driver: RunDriver) -> None:
         """Writes a checkpoint, the policies, and how far the run is, in case it is killed."""
         super()._save(driver)
         self._attempt("the policies", lambda: self._save_policies(driver))
@@ -270,13 +270,13 @@ class RunFiles(Files[Driver]):
         }
         self._attempt("summary.json", lambda: self._write_json("summary.json", reached))
 
-    def _save_checkpoint(self, driver: Driver) -> None:
+    def _save_checkpoint(self, driver: RunDriver) -> None:
         """Writes a checkpoint, which says how long metrics.csv is with all rows in it."""
         self._write_rows()
         content = driver.checkpoint()._replace(metrics_bytes=self._metrics.stat().st_size)
         resume.save(self._checkpoints, content, even=content.is_even(driver.config.eval_every))
 
-    def _save_policies(self, driver: Driver) -> None:
+    def _save_policies(self, driver: RunDriver) -> None:
         """Writes the last and the best policies."""
         settings = self._plan.group_plans[0].ready.policy
         save_policy(self._folder("policy"), driver.states.train_states.actor, settings)
@@ -298,7 +298,7 @@ _CURVES = {
 }
 
 
-class SweepFiles(Files[Training]):
+class SweepFiles(Files[Driver]):
     """Writes the files of a sweep into its directory; raises OSError if one that lasts fails."""
 
     _folders = ("parts",)
@@ -347,12 +347,12 @@ class SweepFiles(Files[Training]):
         """Returns whether the runs of a chunk have ended."""
         return (self._parts / f"{chunk}.npz").exists()
 
-    def began(self, driver: Training) -> None:
+    def began(self, driver: Driver) -> None:
         """Takes a chunk to its newest checkpoint, if there is one."""
         checkpoints = resume.read_checkpoints(self._checkpoints(driver), self._say)
         self._go_on(driver, next(checkpoints, None))
 
-    def ended(self, driver: Training) -> None:
+    def ended(self, driver: Driver) -> None:
         """Writes the part of a chunk, or a checkpoint of one that was interrupted."""
         if not driver.record.done():
             super().ended(driver)
@@ -363,7 +363,7 @@ class SweepFiles(Files[Training]):
         self._write_part(driver)
         resume.remove_checkpoints(self._checkpoints(driver))
 
-    def finished(self, driver: Training, summary: dict[str, Any]) -> None:
+    def finished(self, driver: Driver, summary: dict[str, Any]) -> None:
         """Joins the parts so far, sorted; those of a sweep that ended go after sweep.json."""
         self._check_place()
         paths = sorted(self._parts.glob("*.npz"))
@@ -381,14 +381,14 @@ class SweepFiles(Files[Training]):
         if summary["status"] == "finished":
             shutil.rmtree(self._parts)
 
-    def _save_checkpoint(self, driver: Training) -> None:
+    def _save_checkpoint(self, driver: Driver) -> None:
         resume.save(self._checkpoints(driver), driver.checkpoint(), even=False)
 
-    def _checkpoints(self, driver: Training) -> Path:
+    def _checkpoints(self, driver: Driver) -> Path:
         """Returns the folder of a chunk's checkpoints."""
         return self._parts / driver.runs.name
 
-    def _write_part(self, driver: Training) -> None:
+    def _write_part(self, driver: Driver) -> None:
         """Writes what a chunk measured, and the last policies of each configuration's ends."""
         runs = driver.runs
         arrays = since_their_end(driver.record.history()) | runs._asdict()

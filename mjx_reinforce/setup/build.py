@@ -57,22 +57,29 @@ def build(
     """
     check_environment(env)
     horizon = check_horizon(env, config.horizon)
-    forever, described = config.normalize_steps is None, policy_settings(env, config)
-    policy = build_policy(described) if policy is None else policy
-    check_networks(env, config, policy, config.training_horizon(horizon), num_seeds)
+    training_horizon = config.training_horizon(horizon)
+    if policy is None:
+        policy = build_policy(policy_settings(env, config))
+    # First, so that settings that cannot fit are refused before anything is compiled.
+    check_networks(env, config, policy, training_horizon, num_seeds)
+    normalize_steps = config.normalize_steps
+    if normalize_steps is None:  # without end
+        normalize_steps = math.inf
     shared = {  # of all algorithms, the user's too
         "policy": policy,
-        "horizon": config.training_horizon(horizon),
-        "normalize_steps": math.inf if forever else config.normalize_steps,
+        "horizon": training_horizon,
+        "normalize_steps": normalize_steps,
         "normalize_min_std": config.normalize_min_std,
         "engine": config.engine,
     }
     if is_own(config.algorithm):
-        learner = _made_by_user("algorithm", config.algorithm, ALGORITHMS, env, config, **shared)
+        learner = _call_choice("algorithm", config.algorithm, ALGORITHMS, env, config, **shared)
+        # What the user's code returns fails here in one line, not inside of a program.
         wrappers.check_learner(config.algorithm, learner)
         return learner, horizon
     algorithm = find_algorithm(config.algorithm)
     learner = load_definition(algorithm.make)(env, config, **shared)
+    # A search plays no ``Trajectory`` of one policy, which the wrappers take.
     if not algorithm.search_episodes:
         learner = _for_many_seeds(learner, config, shared["horizon"], devices)
     return learner, horizon
@@ -80,21 +87,27 @@ def build(
 
 def policy_settings(env: Environment, config: Config) -> dict[str, Any]:
     """Returns what ``policy_files.build_policy`` needs to build the policy without the env."""
-    space, algorithm = action_space(env), find_algorithm(config.algorithm)
+    space = action_space(env)
+    algorithm = find_algorithm(config.algorithm)
     if isinstance(space, Discrete):
-        family, described = "categorical", {"num_actions": space.num_actions}
+        family = "categorical"
+        space_settings: dict[str, Any] = {"num_actions": space.num_actions}
     else:
+        # A search moves the parameters at random, and needs no random actions.
         family = "deterministic" if algorithm.search_episodes else "normal"
-        described = {"action_low": space.low.tolist(), "action_high": space.high.tolist()}
+        space_settings = {"action_low": space.low.tolist(), "action_high": space.high.tolist()}
+    if config.policy != "auto":
+        family = config.policy
+    # The algorithm's own settings come last: a published program has its initializer, for one.
     return {
         "env": config.env,
-        "policy": family if config.policy == "auto" else config.policy,
+        "policy": family,
         "hidden_sizes": list(config.hidden_sizes),
         "initializer": "orthogonal",
         "initial_std": config.initial_std,
         "rescale": True,
         "observation_size": observation_size(env),
-        **described,
+        **space_settings,
         **algorithm.policy,
     }
 
@@ -118,6 +131,8 @@ def _for_many_seeds(
 ) -> Learner:
     """Returns a learner with what many seeds need, see ``training.wrappers``."""
     cut_steps = 0
+    # The launch is wrapped around the cut, whose limit it applies to the episodes of training and
+    # not to an evaluation's.
     if config.train_horizon is not None and config.whole_after < 1:
         cut_steps = config.train_horizon
         learner = schedules.Cut(cut_steps, config.whole_after)(learner)
@@ -125,22 +140,23 @@ def _for_many_seeds(
     return wrappers.short_episodes(learner, horizon, config.num_seeds, cut_steps)
 
 
-def _made_by_user(
-    kind: str, name: str, known: Mapping[str, Any], *arguments: object, **more: object
+def _call_choice(
+    kind: str, name: str, choices: Mapping[str, Any], *arguments: object, **options: object
 ) -> Any:
     """Returns what the user's own function returns, or raises ValueError with what it raised."""
-    make = load_choice(kind, name, known)
+    make = load_choice(kind, name, choices)
     try:
-        return make(*arguments, **more)
+        return make(*arguments, **options)
     except (Exception, SystemExit) as error:  # the user's code may raise anything
         raise ValueError(f"cannot build the {kind} {name!r}: {explain(error)}") from error
 
 
 def _build_estimator(config: Config, horizon: int) -> Estimator:
+    """Returns the estimator of the settings, of the package or of the user."""
     if config.estimator == "value-baseline":
         estimator = _build_value_baseline(config, horizon)
     elif is_own(config.estimator):
-        estimator = _made_by_user("estimator", config.estimator, ESTIMATORS, config.discount)
+        estimator = _call_choice("estimator", config.estimator, ESTIMATORS, config.discount)
         example = "mjx_reinforce.reward_to_go(0.99)"
         check_kind(f"what {config.estimator} returns", estimator, estimators.Estimator, example)
     else:
@@ -151,6 +167,7 @@ def _build_estimator(config: Config, horizon: int) -> Estimator:
 
 
 def _build_value_baseline(config: Config, horizon: int) -> Estimator:
+    """Returns the estimator with a value network for episodes of ``horizon`` steps."""
     return value_baseline(
         config.discount,
         horizon=horizon,
@@ -162,8 +179,11 @@ def _build_value_baseline(config: Config, horizon: int) -> Estimator:
 
 
 def _build_optimizer(config: Config, space: Box | Discrete) -> optax.GradientTransformation:
+    """Returns the optimizer of the settings, with the schedules behind it."""
     rate = config.learning_rate
-    final = rate / 10 if config.final_learning_rate is None else config.final_learning_rate
+    final_rate = config.final_learning_rate
+    if final_rate is None:
+        final_rate = rate / 10
     optimizer = make_optimizer(
         config.optimizer, rate, max_grad_norm=config.max_grad_norm, momentum=config.momentum
     )
@@ -172,8 +192,11 @@ def _build_optimizer(config: Config, space: Box | Discrete) -> optax.GradientTra
         optimizer = optax.chain(optax.sgd(rate), optax.scale(1 / config.learning_rate))
     if config.decay_steps is None:
         return optimizer
-    length = None if config.decay_steps == "budget" else config.decay_steps
-    optimizer = optax.chain(optimizer, schedules.decay_rate(final / config.learning_rate, length))
+    length = config.decay_steps
+    if length == "budget":  # as long as that, of env steps or updates
+        length = None
+    # Behind the optimizer: Adam would divide a factor on its gradients out again.
+    optimizer = optax.chain(optimizer, schedules.decay_rate(final_rate / rate, length))
     if config.final_std is None:
         return optimizer
     initial_std = config.initial_std

@@ -14,7 +14,7 @@ from mjx_reinforce.settings.defaults import num_cores
 #: What decides how long they take, of the settings.
 _DECISIVE = ("env", "env_set", "algorithm", "engine", "hidden_sizes", "estimator", "update")
 #: Of most of the package's tasks, on two CPU cores and on a GPU, roughly.
-_FIRST = "usually 5 to 40 s on a quiet machine"
+_TYPICAL_TIME = "usually 5 to 40 s on a quiet machine"
 
 
 def describe_compiling(config: Config, swept: Iterable[str] = ()) -> str:
@@ -26,11 +26,12 @@ def describe_compiling(config: Config, swept: Iterable[str] = ()) -> str:
     """
     cache = Cache.find()
     if cache is None:
-        return f"compiling, {_FIRST}; nothing is kept here, so the next start compiles again"
+        return f"compiling, {_TYPICAL_TIME}; nothing is kept here, so the next start compiles again"
+    # Nothing is there before the first time, and what is there may be damaged.
     with contextlib.suppress(ValueError, TypeError):
         seconds = float(json.loads(cache.read(_key(config, swept)) or b"null"))
         return f"compiling, about {max(seconds, 1.0):.0f} s the last time"
-    return f"compiling, {_FIRST}, less where the programs are on disk"
+    return f"compiling, {_TYPICAL_TIME}, less where the programs are on disk"
 
 
 def keep_seconds(config: Config, swept: Iterable[str], seconds: float) -> None:
@@ -42,5 +43,5 @@ def keep_seconds(config: Config, swept: Iterable[str], seconds: float) -> None:
 def _key(config: Config, swept: Iterable[str]) -> str:
     """Returns the name under which the time is kept, on this machine."""
     machine = [jax.local_devices()[0].device_kind, num_cores()]
-    known = repr([machine, *(getattr(config, name) for name in _DECISIVE), sorted(swept)])
-    return f"{hashlib.sha256(known.encode()).hexdigest()}-seconds"
+    description = repr([machine, *(getattr(config, name) for name in _DECISIVE), sorted(swept)])
+    return f"{hashlib.sha256(description.encode()).hexdigest()}-seconds"

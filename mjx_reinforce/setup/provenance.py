@@ -45,10 +45,13 @@ def _git_commit() -> str | None:
 
     A commit of documents or tests changes no result, and a run goes on after it.
     """
-    here = Path(__file__).parent
-    folders = [str(here.parent), str((here.parent / "envs").resolve())]
-    command = ["git", "-C", str(here), "log", "-1", "--format=%H", "--", *folders]
+    package = Path(__file__).parent.parent
+    # In a checkout the environments are a link to a folder beside the package: git follows none.
+    folders = [str(package), str((package / "envs").resolve())]
+    command = ["git", "-C", str(package), "log", "-1", "--format=%H", "--", *folders]
+    # There may be no git; and where the package is installed, no repository, or one that is not
+    # ours and has no commit of these files: then the output is empty.
     with contextlib.suppress(OSError, subprocess.CalledProcessError):
-        done = subprocess.run(command, capture_output=True, check=True, text=True)
-        return done.stdout.strip() or None
+        log = subprocess.run(command, capture_output=True, check=True, text=True)
+        return log.stdout.strip() or None
     return None

@@ -1,6 +1,6 @@
-"""A run made ready: what its settings come to, and its programs before they are compiled.
+"""A run that is ready: what its settings come to, and its programs before they are compiled.
 
-Programs are kept on disk, as JAX exports them: a run that was compiled before is not traced. They
+Programs are saved on disk, as JAX exports them: a run that was compiled before is not traced. They
 lie beside XLA's compiled programs in JAX's cache, under a hash of all that they depend on: every
 source file of this package, the versions of others, the settings, the device. What a run begins
 with (its seeds) and when it ends are inputs of its programs. What they take and return is described
@@ -54,7 +54,7 @@ class Ready(NamedTuple):
     programs: Callable[[], Programs]
 
 
-def get_ready(
+def load_or_build_ready(
     config: Config,
     default: Config,
     env: Environment | None = None,
@@ -67,37 +67,45 @@ def get_ready(
       config: the settings.
       default: those that hold where the user gave none.
       env: the environment; by default the one that the settings name, built if it is needed.
-      division: see ``made``.
-      traced: see ``made``.
+      division: see ``build_ready``.
+      traced: see ``build_ready``.
 
     Raises:
       ValueError: the settings do not fit the environment.
     """
-    key = key_of(config) if traced is None else None
-    ready = None if key is None else _found(key, config, division)
+    # Programs of a sweep take settings as arguments, and are not saved.
+    key = None
+    if traced is None:
+        key = key_of(config)
+    ready = None
+    if key is not None:
+        ready = _load_of_settings(key, config, division)
     if ready is None:
-        built = envs.make_set(config.env, config.env_set) if env is None else env
-        ready = made(built, config, division, traced)
+        task = envs.make_set(config.env, config.env_set) if env is None else env
+        ready = build_ready(task, config, division, traced)
         if key is not None:
-            ready = keep(key, ready)
+            ready = save_ready(key, ready)
     if config.resume is None and config.policy == "auto":
         check_read_by_policy(config, default, ready.policy["policy"])
     return ready
 
 
-def _found(key: str, config: Config, division: Division) -> Ready | None:
+def _load_of_settings(key: str, config: Config, division: Division) -> Ready | None:
     """Returns what is on disk of the settings; None if nothing is."""
-    found = read_ready(key, division)
-    if found is None and config.resume is not None:
-        # A run that is resumed has its time limit from config.json, also one that was not given.
-        first = key_of(dataclasses.replace(config, horizon=None))
-        found = None if first is None else read_ready(first, division)
-        if found is not None and found.horizon != config.horizon:
-            return None
-    return found
+    ready = load_ready(key, division)
+    if ready is not None or config.resume is None:
+        return ready
+    # A run that is resumed has its time limit from config.json, also one that was not given: its
+    # programs may be there under the key without a limit.
+    first_key = key_of(dataclasses.replace(config, horizon=None))
+    if first_key is not None:
+        ready = load_ready(first_key, division)
+    if ready is not None and ready.horizon != config.horizon:
+        return None
+    return ready
 
 
-def made(
+def build_ready(
     env: Environment,
     config: Config,
     division: Division = ALONE,
@@ -116,32 +124,44 @@ def made(
       ValueError: the settings do not fit the environment.
     """
     devices = division.devices() if division.episodes > 1 else None
-    width = division.width(config.num_seeds) if traced is None else 1
+    # Programs of a sweep are traced for one run: as many as fit are put side by side later.
+    width = 1
+    if traced is None:
+        width = division.width(config.num_seeds)
     learner, horizon = build(env, config, devices=devices, num_seeds=width)
-    policy, threshold = policy_settings(env, config), getattr(env, "reward_threshold", None)
+    threshold = getattr(env, "reward_threshold", None)
+    if threshold is not None:
+        threshold = float(threshold)
 
     def build_learner(settings: dict[str, Any]) -> Learner:
+        """Returns the learner with these settings traced; the one above without any."""
         if not settings:
             return learner
         if config.algorithm != "reinforce":
             return build(env, dataclasses.replace(config, **settings))[0]
         # How REINFORCE plays depends on no traced number, and takes a second to write out.
         with warnings.catch_warnings(action="ignore"):  # this engine does not play
-            other = build(env, dataclasses.replace(config, engine="vmap", **settings))[0]
-        return learner._replace(init=other.init, learn=other.learn)
+            vmap_learner, _ = build(env, dataclasses.replace(config, engine="vmap", **settings))
+        return learner._replace(init=vmap_learner.init, learn=vmap_learner.learn)
 
     @functools.cache
     def programs() -> Programs:
+        """Returns the programs, which take a second to trace: once, and only if asked for."""
         return programs_of(
-            *(env, build_learner, horizon, config, width, traced or ()),
-            whole=traced is None,
+            env,
+            build_learner,
+            horizon,
+            config,
+            width,
+            traced or (),
+            all_metrics=traced is None,
             division=division,
         )
 
     return Ready(
         horizon=horizon,
-        threshold=None if threshold is None else float(threshold),
-        policy=policy,
+        threshold=threshold,
+        policy=policy_settings(env, config),
         engine=learner.engine.name,
         why=learner.engine.why,
         programs=programs,
@@ -154,78 +174,98 @@ _PROGRAMS = ("begin", "advance", "evaluate")
 def key_of(config: Config) -> str | None:
     """Returns a name for all that the programs of a run depend on.
 
-    None where nothing is kept: where ``Cache.find`` finds no place, and of code or a model of the
+    None where nothing is saved: where ``Cache.find`` finds no place, and of code or a model of the
     user's.
     """
     cache = Cache.find()
-    own = not envs.is_ours(config.env) or any(is_own(getattr(config, name)) for name in CODE)
-    if cache is None or own:
+    if cache is None:
+        return None
+    # The user's code is no source file of this package, and may import what it likes.
+    if not envs.is_ours(config.env) or any(is_own(getattr(config, name)) for name in CODE):
         return None
     if "xml_file" in split_words(config.env_set):  # the file may change
         return None
-    made_by = provenance()
-    del made_by["git_commit"]  # the sources say it better
+    origin = provenance()
+    del origin["git_commit"]  # the sources say it better
     # Of the budgets, ``block_length`` says what changes a program.
     inputs = marked(Mark.NOT_COMPILED)
     settings = {k: v for k, v in recordable(config).items() if k not in inputs}
-    known = {
+    dependencies = {
         "settings": settings | {"block": config.block_length},
         "engine": cache.made_by("mjx_reinforce"),
-        "made_by": made_by,
+        "made_by": origin,
         "numpy": version("numpy"),
     }
-    return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(dependencies, sort_keys=True).encode()).hexdigest()
 
 
-def keep(key: str, ready: Ready) -> Ready:
-    """Returns what is made ready, with programs that are written to disk when they are traced.
+def save_ready(key: str, ready: Ready) -> Ready:
+    """Returns the same with programs that are written to disk when they are traced.
 
-    A program that JAX cannot export, such as one that calls Python, is not kept.
+    A program that JAX cannot export, such as one that calls Python, is not saved.
 
     Args:
       key: of ``key_of``.
-      ready: all of it but the programs is in JSON's types.
+      ready: what is saved; all of it but the programs is in JSON's types.
     """
-    programs, facts, cache = ready.programs(), ready._asdict(), Cache.find()
+    programs = ready.programs()
     like = programs.like
+    facts = ready._asdict()
     del facts["programs"]
+    cache = Cache.find()
     assert cache is not None  # there is a key
+    # A state of the user's own classes is no error; it is not saved.
     try:
-        whole = {"facts": facts, "like": describe_tree(like), "rides": programs.rides}
+        content = {
+            "facts": facts,
+            "like": describe_tree(like),
+            "advance_evaluates": programs.advance_evaluates,
+        }
     except TypeError:
         return ready
-    cache.write(f"{key}-facts", json.dumps(whole).encode())
+    cache.write(f"{key}-facts", json.dumps(content).encode())
+    # Shapes of the arguments, in the order in which ``Programs`` describes them.
     width = len(like.eval_keys)
-    seed, numbers, count = (jax.ShapeDtypeStruct(x, np.uint32) for x in ((), (width,), (2,)))
+    seed = jax.ShapeDtypeStruct((), np.uint32)
+    numbers = jax.ShapeDtypeStruct((width,), np.uint32)
     rows = jax.ShapeDtypeStruct((width, StateRows(like).size), np.uint8)
-    which, look = (jax.ShapeDtypeStruct(x, bool) for x in ((width,), ()))
-    given = {
+    budget = (jax.ShapeDtypeStruct((2,), np.uint32),) * len(Budget._fields)
+    occupied = jax.ShapeDtypeStruct((width,), bool)
+    evaluation_due = jax.ShapeDtypeStruct((), bool)
+    arguments = {
         "begin": (seed, numbers, {}),  # a run has no settings that are traced
-        "advance": (rows, (count,) * len(Budget._fields), which, look),
-        "evaluate": (rows, which),
+        "advance": (rows, budget, occupied, evaluation_due),
+        "evaluate": (rows, occupied),
     }
-    kept = programs._replace(
-        **{
-            name: cache.keep(f"{key}-{name}", getattr(programs, name), given[name])
-            for name in _PROGRAMS
-        }
-    )
-    return ready._replace(programs=lambda: kept)
+    exported = {
+        name: cache.keep(f"{key}-{name}", getattr(programs, name), arguments[name])
+        for name in _PROGRAMS
+    }
+    programs = programs._replace(**exported)
+    return ready._replace(programs=lambda: programs)
 
 
-def read_ready(key: str, division: Division = ALONE) -> Ready | None:
-    """Returns what was kept under a name; None unless all of it is on disk."""
+def load_ready(key: str, division: Division = ALONE) -> Ready | None:
+    """Returns what ``save_ready`` wrote under a key; None unless all of it is on disk."""
     cache = Cache.find()
-    facts = None if cache is None else cache.read(f"{key}-facts")
-    if cache is None or facts is None:
+    if cache is None:
         return None
-    loaded: list[Any] = [cache.load(f"{key}-{name}") for name in _PROGRAMS]
-    if any(program is None for program in loaded):
+    text = cache.read(f"{key}-facts")
+    if text is None:
         return None
-    whole = json.loads(facts)
-    like = rebuild(whole["like"])
-    programs = Programs(*loaded, rides=whole["rides"], like=like, division=division)
-    return Ready(**whole["facts"], programs=lambda: programs)
+    # A crash may have left some of them, and one that JAX could not export is never there.
+    loaded_programs: list[Any] = [cache.load(f"{key}-{name}") for name in _PROGRAMS]
+    if any(program is None for program in loaded_programs):
+        return None
+    content = json.loads(text)
+    like = rebuild(content["like"])
+    programs = Programs(
+        *loaded_programs,
+        advance_evaluates=content["advance_evaluates"],
+        like=like,
+        division=division,
+    )
+    return Ready(**content["facts"], programs=lambda: programs)
 
 
 #: The packages whose classes a description may name.
@@ -245,14 +285,16 @@ def describe_tree(tree: PyTree) -> Any:
         return None
     if isinstance(tree, dict):
         return {"dict": {name: describe_tree(x) for name, x in tree.items()}}
-    kind, fields = type(tree), _fields(tree)
+    kind = type(tree)
+    fields = _fields(tree)
+    # Classes are named, and loaded by that name; a name in a file must not load any code there is.
     if fields is not None:
         if kind.__module__.partition(".")[0] not in _PACKAGES:
             raise TypeError(f"{kind} is of another package than {', '.join(_PACKAGES)}")
         if "." in kind.__qualname__:
             raise TypeError(f"{kind} is not at the top of its module")
-        parts = {name: describe_tree(getattr(tree, name)) for name in fields}
-        return {"class": f"{kind.__module__}:{kind.__qualname__}", "fields": parts}
+        values = {name: describe_tree(getattr(tree, name)) for name in fields}
+        return {"class": f"{kind.__module__}:{kind.__qualname__}", "fields": values}
     if isinstance(tree, tuple | list):
         return {kind.__name__: [describe_tree(x) for x in tree]}
     if not hasattr(tree, "shape"):
@@ -260,28 +302,28 @@ def describe_tree(tree: PyTree) -> Any:
     return {"leaf": "key" if is_key(tree) else np.dtype(tree.dtype).name, "shape": list(tree.shape)}
 
 
-def rebuild(described: Any) -> Any:
+def rebuild(description: Any) -> Any:
     """Returns the pytree of ``describe_tree``; its leaves are ``jax.ShapeDtypeStruct``.
 
     Raises:
       ValueError, KeyError, TypeError, AttributeError or ImportError: it is no such description.
     """
-    if described is None:
+    if description is None:
         return None
-    if "leaf" in described:
-        kind = described["leaf"]
+    if "leaf" in description:
+        kind = description["leaf"]
         dtype = jax.eval_shape(jax.random.key, 0).dtype if kind == "key" else np.dtype(kind)
-        return jax.ShapeDtypeStruct(tuple(described["shape"]), dtype)
-    if "class" in described:
-        module, _, name = described["class"].partition(":")
+        return jax.ShapeDtypeStruct(tuple(description["shape"]), dtype)
+    if "class" in description:
+        module, _, name = description["class"].partition(":")
         if module.partition(".")[0] not in _PACKAGES:
             raise ValueError(f"{module} is of another package than {', '.join(_PACKAGES)}")
-        parts = {name: rebuild(x) for name, x in described["fields"].items()}
-        return getattr(importlib.import_module(module), name)(**parts)
-    if "dict" in described:
-        return {name: rebuild(x) for name, x in described["dict"].items()}
-    ((kind, parts),) = described.items()
-    return {"tuple": tuple, "list": list}[kind](map(rebuild, parts))
+        values = {name: rebuild(x) for name, x in description["fields"].items()}
+        return getattr(importlib.import_module(module), name)(**values)
+    if "dict" in description:
+        return {name: rebuild(x) for name, x in description["dict"].items()}
+    ((kind, children),) = description.items()
+    return {"tuple": tuple, "list": list}[kind](map(rebuild, children))
 
 
 def _fields(tree: PyTree) -> tuple[str, ...] | None:

@@ -20,9 +20,11 @@ from mjx_reinforce.settings.groups import Reader
 _FLOAT = 4
 #: Copies of the states of training while an update is made: those before it and after it on the
 #: device; on the host its own, those before the last block, and the policies alone the best.
-_DEVICE_STATES, _HOST_STATES = 2, 2
+_DEVICE_STATES = 2
+_HOST_STATES = 2
 #: What an optimizer keeps of each parameter, with the parameter itself.
-_ADAM, _SGD = 3, 1
+_ADAM = 3
+_SGD = 1
 #: Vectors of the conjugate gradients: the solution, the residual, the direction, its product.
 _SOLVER = 4
 
@@ -56,17 +58,23 @@ def _of_seed(config: Config, policy: Policy, entries: int, horizon: int) -> int:
     leaves = jax.tree.leaves(jax.eval_shape(policy.init, jax.random.key(0)))
     weights = _FLOAT * sum(math.prod(x.shape) for x in leaves)
     states = weights
-    passing = 0
+    temporary = 0
     if config.algorithm == "reinforce":
         value = _value_bytes(config, entries)
         natural = config.update == "natural-gradient"
+        # Natural gradients take their steps by SGD, whatever the optimizer of the settings is.
         adam = config.optimizer == "adam" and not natural
         states = (_ADAM if adam else _SGD) * weights + _ADAM * value
+        # Vectors as long as the parameters: the gradient, those of groups of episodes that tell
+        # its noise, and the solver's. Then what the hidden layers put out for a chunk of steps.
         vectors = 1 + num_noise_episodes(config.num_episodes) + _SOLVER * natural
         samples = config.num_episodes * chunk_length(horizon, config.num_episodes)
-        passing = vectors * weights + value + _FLOAT * samples * sum(config.hidden_sizes)
-    host = _HOST_STATES * states + weights if jax.default_backend() == "cpu" else 0
-    return _DEVICE_STATES * states + passing + host
+        temporary = vectors * weights + value + _FLOAT * samples * sum(config.hidden_sizes)
+    # On a CPU the host's memory is the device's too.
+    host = 0
+    if jax.default_backend() == "cpu":
+        host = _HOST_STATES * states + weights
+    return _DEVICE_STATES * states + temporary + host
 
 
 def _value_bytes(config: Config, entries: int) -> int:

@@ -1,7 +1,7 @@
 """How the work of a run is divided among the devices of a process.
 
 Where there are as many seeds as devices, or more, each device trains some of the seeds, and says
-nothing to the others. Where there are fewer, each plays a part of the episodes of every update of
+nothing to the others. Where there are fewer, each plays some of the episodes of every update of
 all seeds, and the sums over episodes are over all devices. Neither changes a number but by
 rounding: the keys of an episode follow from its seed and its own number.
 """
@@ -42,7 +42,7 @@ class Division:
         """Returns how many of the seeds a device has at most."""
         return -(-num_seeds // self.seeds)
 
-    def lanes(self, num_seeds: int) -> int:
+    def capacity(self, num_seeds: int) -> int:
         """Returns how many seeds all devices have room for, of so many; some stay empty."""
         return self.seeds * self.width(num_seeds)
 
@@ -62,20 +62,26 @@ class Division:
           out_specs: the same of its result.
           by_episodes: whether it divides episodes itself.
         """
+        # On one device nothing is divided, and a program needs no shardings.
         if self.count == 1:
             return jax.jit(function)
         devices = self.devices()
+        # Each device computes its own seeds, and none waits for another.
         if self.seeds > 1:
             return devices.jit(function, in_specs, out_specs)
-        everywhere = devices.shardings(NONE)
+        # All devices get all seeds. A function that divides episodes maps that alone over them;
+        # XLA divides what follows from the episodes.
+        replicated = devices.shardings(NONE)
         if by_episodes:
-            shardings = {"in_shardings": everywhere, "out_shardings": everywhere}
+            shardings = {"in_shardings": replicated, "out_shardings": replicated}
             return jax.jit(function, **shardings)
         return devices.jit(function, NONE, NONE)
 
     def shapes(self, tree: PyTree, spec: PartitionSpec) -> Any:
         """Returns the shapes of arrays as ``put`` places them."""
-        return tree if self.count == 1 else self.devices().shapes(tree, self._spec(spec))
+        if self.count == 1:
+            return tree
+        return self.devices().shapes(tree, self._spec(spec))
 
     def put(self, tree: PyTree, spec: PartitionSpec = RUNS) -> Any:
         """Returns arrays for a function of ``jit``.
@@ -84,7 +90,9 @@ class Division:
           tree: arrays.
           spec: RUNS where their first axis is that of the seeds, NONE where none is.
         """
-        return tree if self.count == 1 else self.devices().put(tree, self._spec(spec))
+        if self.count == 1:
+            return tree
+        return self.devices().put(tree, self._spec(spec))
 
     def _spec(self, spec: PartitionSpec) -> PartitionSpec:
         return spec if self.seeds > 1 else NONE

@@ -50,31 +50,31 @@ class Evaluation(NamedTuple):
     train_states: TrainState
 
 
-#: The runs that an observer sees.
-Seen = TypeVar("Seen", bound="Training")
+#: What an observer sees: any runs, or a run by itself.
+DriverT = TypeVar("DriverT", bound="Driver")
 
 
-class Observer(Generic[Seen]):
+class Observer(Generic[DriverT]):
     """Sees runs go on, and changes nothing of them; what a subclass leaves out does nothing."""
 
-    def began(self, driver: Seen) -> None:
+    def began(self, driver: DriverT) -> None:
         """Called before the first update, also of runs that go on."""
 
-    def updated(self, driver: Seen, met: np.ndarray) -> None:
+    def updated(self, driver: DriverT, met: np.ndarray) -> None:
         """Called after each block of updates.
 
         Args:
-          driver: of the runs.
+          driver: of the runs, after the block.
           met: [S] how many of the last block met numbers which are not finite, of each seed.
         """
 
-    def evaluated(self, driver: Seen, evaluation: Evaluation, rows: Arrays) -> None:
+    def evaluated(self, driver: DriverT, evaluation: Evaluation, rows: Arrays) -> None:
         """Called after each evaluation, with what it measured and its rows in metrics.csv."""
 
-    def ended(self, driver: Seen) -> None:
+    def ended(self, driver: DriverT) -> None:
         """Called after the last block of updates and its evaluation, before the last test."""
 
-    def finished(self, driver: Seen, summary: dict[str, Any]) -> None:
+    def finished(self, driver: DriverT, summary: dict[str, Any]) -> None:
         """Called after the last test, with the contents of summary.json, or of sweep.json."""
 
 
@@ -83,9 +83,9 @@ class Observer(Generic[Seen]):
 _SECONDS = 0.25
 
 
-def check_layout(found: Checkpoint, slots: Slots) -> None:
+def check_layout(checkpoint: Checkpoint, slots: Slots) -> None:
     """Raises ValueError for a checkpoint of another program."""
-    if found.layout != slots.layout.layout:
+    if checkpoint.layout != slots.layout.layout:
         raise ValueError(
             "the states in the checkpoint do not fit this version of the program; resume with "
             "the version that wrote it"
@@ -96,19 +96,19 @@ class Runs(NamedTuple):
     """Runs of a sweep that move on together; those of a run are its seeds.
 
     name: of these, for their files
-    place: [R] the configuration of each run, counted within its group
+    member: [R] the configuration of each run, counted within its group
     configuration: [R] the same, counted in the sweep
     seed: [R]
     """
 
     name: str
-    place: np.ndarray
+    member: np.ndarray
     configuration: np.ndarray
     seed: np.ndarray
 
 
-class Training:
-    """Runs as they go on, such as a part of a sweep's.
+class Driver:
+    """Trains runs, such as a chunk of a sweep's.
 
     config: the settings; one of those that differ from run to run stands for any value
     slots: what moves the runs
@@ -127,22 +127,29 @@ class Training:
         observers: Sequence[Observer[Any]] = (),
     ):
         """Begins before the first update, where the slots are."""
-        self.config, self.slots, self.record, self.runs = config, slots, record, runs
-        self.observers, self.ended = list(observers), False
+        self.config = config
+        self.slots = slots
+        self.record = record
+        self.runs = runs
+        self.observers = list(observers)
+        self.ended = False
         self._began = time.perf_counter()
         #: Wall time at which the present policies were there (s).
         self._reached = 0.0
 
-    def restore(self, found: Checkpoint) -> None:
+    def restore(self, checkpoint: Checkpoint) -> None:
         """Goes back to a checkpoint, or raises ValueError if it is another program's."""
-        check_layout(found, self.slots)
-        self.slots.restore(found.states)
-        self.record.restore(found.record)
-        self._began, self._reached = time.perf_counter() - found.seconds, found.seconds
+        check_layout(checkpoint, self.slots)
+        self.slots.restore(checkpoint.states)
+        self.record.restore(checkpoint.record)
+        # As if the run had not stopped: its clock goes on from the time in the checkpoint.
+        self._began = time.perf_counter() - checkpoint.seconds
+        self._reached = checkpoint.seconds
 
     def checkpoint(self) -> Checkpoint:
         """Returns what ``restore`` takes."""
         config = self.config
+        # Best policies and metrics.csv are a run's, which fills them in; a sweep has neither.
         return Checkpoint(
             layout=self.slots.layout.layout,
             states=self.slots.rows(),
@@ -172,31 +179,38 @@ class Training:
         Args:
           interrupted: whether the runs are to end soon.
         """
-        blocks, most = 1, self._most()
+        num_blocks = 1
+        max_blocks = self._max_blocks()
         while not (self.ended or interrupted()):
-            look = not self.record.is_evaluated()
+            evaluate = not self.record.is_evaluated()
             if self.record.over():
-                if look:
+                # No updates follow with which the last policies could be evaluated.
+                if evaluate:
                     self._take([self.slots.evaluate()])
                 break
-            began = time.perf_counter()
-            measured = self.slots.advance(*self.record.moved(), look=look, most=blocks)
-            enough = len(measured) * _SECONDS / (time.perf_counter() - began)
-            blocks = max(1, min(int(enough), 2 * len(measured), most))
-            self._take(measured)
+            start = time.perf_counter()
+            active, lengths = self.record.moved()
+            blocks = self.slots.advance(active, lengths, evaluate=evaluate, max_blocks=num_blocks)
+            # As many blocks at once as take ``_SECONDS`` at this speed. At most twice as many as
+            # now: while a policy learns, episodes may become longer.
+            timely = len(blocks) * _SECONDS / (time.perf_counter() - start)
+            num_blocks = max(1, min(int(timely), 2 * len(blocks), max_blocks))
+            self._take(blocks)
 
-    def _most(self) -> int:
-        """Returns how many blocks of updates may be made before anyone looks."""
+    def _max_blocks(self) -> int:
+        """Returns how many blocks of updates are made before the host sees any of them."""
         return (self.config.checkpoint_every or MAX_COUNT) // self.config.eval_every
 
     def _take(self, blocks: list[Measured]) -> None:
         """Takes in evaluations and the updates that followed them."""
         met = np.zeros(0, int)
         for block in blocks:
-            if block.looked:
+            # The evaluation is of the policies before the block, so it is recorded before.
+            if block.eval_metrics:
                 self._take_evaluation(block)
             if block.metrics:
                 met = self.record.add_updates(block)
+        # All blocks came at once: observers see the last one alone.
         if blocks[0].metrics:
             self._reached = self.seconds()
             for observer in self.observers:
@@ -207,8 +221,8 @@ class Training:
         self.record.add_evaluation(measured, self._reached)
 
 
-class Driver(Training):
-    """The seeds of a run as they go on.
+class RunDriver(Driver):
+    """Trains the seeds of a run by itself, which has evaluations to show and best policies.
 
     config: the settings of the run, its horizon among them
     states: of training, on the host
@@ -217,16 +231,26 @@ class Driver(Training):
 
     record: RunRecord
 
-    def __init__(self, *given: Any):
+    def __init__(
+        self,
+        config: Config,
+        slots: Slots,
+        record: RunRecord,
+        runs: Runs,
+        observers: Sequence[Observer[Any]] = (),
+    ):
         """Begins before the first update, where the slots are."""
-        super().__init__(*given)
-        self.states = self._before = self.slots.states()
+        super().__init__(config, slots, record, runs, observers)
+        self.states = self.slots.states()
+        #: The states before the last block; its evaluation is of these.
+        self._before = self.states
         self.best = first_best(self.states.train_states)
 
-    def restore(self, found: Checkpoint) -> None:
+    def restore(self, checkpoint: Checkpoint) -> None:
         """Goes back to a checkpoint, which has the best policies too."""
-        super().restore(found)
-        self.states, self.best = self.slots.states(), StateRows(self.best).states(found.best)
+        super().restore(checkpoint)
+        self.states = self.slots.states()
+        self.best = StateRows(self.best).states(checkpoint.best)
 
     def checkpoint(self) -> Checkpoint:
         """Returns what ``restore`` takes."""
@@ -240,28 +264,35 @@ class Driver(Training):
         if not self.record.begun():
             self._take([self.slots.evaluate()])
         super().drive(interrupted)
+        # An observer that ends a run leaves the last block of updates without its evaluation.
         if self.ended and not self.record.is_evaluated():
             self._take([self.slots.evaluate()])
 
-    def _most(self) -> int:
+    def _max_blocks(self) -> int:
+        """Returns 1: ``_take`` has the states before one block and after it, none between."""
         return 1
 
     def _take(self, blocks: list[Measured]) -> None:
-        self._before, self.states = self.states, self.slots.states()
+        self._before = self.states
+        self.states = self.slots.states()
         super()._take(blocks)
 
     def _take_evaluation(self, measured: Measured) -> None:
         """Takes in what the policies before a block return, and keeps the best."""
-        before, looked = self._before.train_states, measured.looked
-        actor, num_updates = before.actor, before.num_updates
-        present = Best(actor=actor, eval_return=looked["eval_return"], num_updates=num_updates)
+        eval_metrics = measured.eval_metrics
+        # It is of the policies with which the block began.
+        actor = self._before.train_states.actor
+        num_updates = self._before.train_states.num_updates
+        present = Best(
+            actor=actor, eval_return=eval_metrics["eval_return"], num_updates=num_updates
+        )
         self.best = keep_best(self.best, present)
         rows = self.record.add_evaluation(measured, self._reached)
         evaluation = Evaluation(
             updates=counts.to_int(num_updates),
             env_steps=self.record.env_steps.copy(),
             seconds=self._reached,
-            measured=looked,
+            measured=eval_metrics,
             actor=actor,
             train_states=self.states.train_states,
         )
@@ -281,11 +312,12 @@ class Driver(Training):
         """
         returns = {}
         for name, actor in (("final", self.states.train_states.actor), ("best", self.best.actor)):
+            # Half a test is none: summary.json has both returns or neither.
             if interrupted():
                 return {}
-            result = self.slots.test(actor)
-            self.record.add_test(result)
-            returns[f"{name}_test_returns"] = result["eval_return"].tolist()
+            eval_metrics = self.slots.test(actor)
+            self.record.count_steps(eval_metrics)
+            returns[f"{name}_test_returns"] = eval_metrics["eval_return"].tolist()
         return returns
 
     def summary(self, engine: str, compile_seconds: float, test: dict[str, Any]) -> dict[str, Any]:
@@ -296,6 +328,8 @@ class Driver(Training):
           compile_seconds: wall time of compiling.
           test: from ``test``, empty if the run was interrupted.
         """
+        # A run that was interrupted goes on when it is resumed, also one without hope: there it
+        # is tested and stopped.
         status = {"status": "finished" if test else "interrupted"}
         if test and self.record.hopeless():
             status = {"status": "stopped", "reason": HOPELESS}
@@ -312,12 +346,12 @@ def begin_run(
     threshold: float | None,
     slots: Slots,
     runs: Runs,
-    found: Checkpoint | None = None,
+    checkpoint: Checkpoint | None = None,
     actors: Actor | None = None,
     say: Callable[[str], None] = lambda text: None,
     observers: Sequence[Observer[Any]] = (),
     interrupted: Callable[[], bool] = lambda: False,
-) -> Driver:
+) -> RunDriver:
     """Returns a run before its first update.
 
     Args:
@@ -325,30 +359,53 @@ def begin_run(
       threshold: the return that counts as solved, if any.
       slots: its seeds.
       runs: the same, by their numbers.
-      found: the checkpoint from which it goes on, if any; an observer takes it back there.
+      checkpoint: from which it goes on, if any; an observer takes it back there.
       actors: [S, ...] with which it begins, if not with its own.
       say: shows a line to the user.
       observers: who sees it.
       interrupted: whether it is to end soon.
     """
-    if found is not None:
-        check_layout(found, slots)  # before a file is touched
+    if checkpoint is not None:
+        check_layout(checkpoint, slots)  # before a file is touched
     if actors is not None:
         slots.restore(begin_with(slots.states(), actors))
     if config.minutes is not None:
-        first = slots.rows()
-        if found is not None:
-            slots.restore(found.states)
+        # From here on the budget is in env steps, so that a run that is resumed, or repeated with
+        # its config.json, ends where this one does. The speed is that of the states from which it
+        # goes on; what is trained to measure it is undone.
+        first_rows = slots.rows()
+        if checkpoint is not None:
+            slots.restore(checkpoint.states)
         env_steps = env_steps_in(60 * config.minutes, slots, config, interrupted)
-        slots.restore(first)
+        slots.restore(first_rows)
         say(f"{config.minutes:g} min are about {env_steps:,} env steps per seed here")
         config = dataclasses.replace(config, env_steps=env_steps, minutes=None)
     slots.budget = Budget.of(config.env_steps, config.max_updates)
-    return Driver(config, slots, RunRecord(config, threshold), runs, observers)
+    return RunDriver(config, slots, RunRecord(config, threshold), runs, observers)
 
 
-#: The part of the time in which its speed is measured; what is trained in it is trained again.
-_PART = 0.03
+#: The share of the time in which its speed is measured; what is trained in it is trained again.
+_TRIAL_SHARE = 0.03
+
+
+class _Moment(NamedTuple):
+    """How far a trial is.
+
+    seconds: since its start
+    env_steps: of the mean seed, those before the trial too
+    updates: of the seed with the most, those before the trial too
+    """
+
+    seconds: float
+    env_steps: float
+    updates: int
+
+    @classmethod
+    def of(cls, seconds: float, slots: Slots) -> "_Moment":
+        """Returns how far the seeds are at this time."""
+        states = slots.states().train_states
+        env_steps = float(counts.to_int(states.env_steps).mean())
+        return cls(seconds, env_steps, int(counts.to_int(states.num_updates).max()))
 
 
 def env_steps_in(
@@ -356,8 +413,8 @@ def env_steps_in(
 ) -> int:
     """Returns the env steps that a mean seed will have played in all after a time.
 
-    The seeds are trained, and evaluated, for a small part of that time. The speed of the second
-    half of that part counts: the first updates also have what a device does once, and the shortest
+    The seeds are trained, and evaluated, for a small share of that time. The speed of the second
+    half of this trial counts: the first updates also have what a device does once, and the shortest
     episodes.
 
     Args:
@@ -366,26 +423,30 @@ def env_steps_in(
       config: the settings.
       interrupted: whether the first update of the trial is to be the last.
     """
-    most = MAX_COUNT if config.max_updates is None else config.max_updates
-    began, past = time.perf_counter(), [(0.0, *_played(slots))]
-    while past[-1][0] < _PART * seconds and not (past[1:] and interrupted()):
-        slots.budget = Budget.of(None, min(past[-1][2] + 2 ** (len(past) - 1), most))
-        if not slots.advance(look=False):
+    max_updates = MAX_COUNT if config.max_updates is None else config.max_updates
+    start_time = time.perf_counter()
+    trial = [_Moment.of(0.0, slots)]
+    # Calls of 1, 2, 4, ... updates: nobody knows yet how long one takes, and so the last call is
+    # about half of the trial.
+    while trial[-1].seconds < _TRIAL_SHARE * seconds and not (trial[1:] and interrupted()):
+        num_updates = 2 ** (len(trial) - 1)
+        slots.budget = Budget.of(None, min(trial[-1].updates + num_updates, max_updates))
+        if not slots.advance(evaluate=False):
             break  # no seed has an update left
-        past.append((time.perf_counter() - began, *_played(slots)))
-    if len(past) == 1:
-        return max(1, round(past[0][1]))
-    end, played, updates = past[-1]
-    half, before, made = next((x for x in past[1:-1] if x[0] >= end / 2), past[-2])
-    a_block = config.block_length * (end - half) / (updates - made)
-    evaluating = slots.seconds_to_evaluate()
-    speed = (played - before) / (end - half) * a_block / (a_block + evaluating)
-    left = max(seconds - end - evaluating, 0.0)
-    return min(max(1, round(past[0][1] + speed * left)), MAX_COUNT)
-
-
-def _played(slots: Slots) -> tuple[float, int]:
-    """Returns the env steps of the mean seed, and the updates of the seed with the most."""
-    states = slots.states().train_states
-    updates = counts.to_int(states.num_updates)
-    return float(counts.to_int(states.env_steps).mean()), int(updates.max())
+        trial.append(_Moment.of(time.perf_counter() - start_time, slots))
+    start = trial[0]
+    end = trial[-1]
+    if len(trial) == 1:
+        return max(1, round(start.env_steps))
+    # The last call alone, if no moment before it is in the second half.
+    halfway = next((x for x in trial[1:-1] if x.seconds >= end.seconds / 2), trial[-2])
+    elapsed = end.seconds - halfway.seconds
+    # The trial was not evaluated. The run is, after every block, and stands still meanwhile unless
+    # evaluations share the launches of updates.
+    block_seconds = config.block_length * elapsed / (end.updates - halfway.updates)
+    eval_seconds = slots.seconds_to_evaluate()
+    speed = (end.env_steps - halfway.env_steps) / elapsed
+    speed = speed * block_seconds / (block_seconds + eval_seconds)
+    # The trial took its time, and what it trained is undone: the run goes on from its start.
+    remaining = max(seconds - end.seconds - eval_seconds, 0.0)
+    return min(max(1, round(start.env_steps + speed * remaining)), MAX_COUNT)

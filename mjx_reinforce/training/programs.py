@@ -39,19 +39,21 @@ BuildLearner = Callable[[dict[str, jax.Array]], Learner]
 class Block(NamedTuple):
     """What a block of updates measured.
 
-    made: [] how many updates were made
+    num_updates: [] how many were made
     metrics: [length, R] each; the rows after the last update are zero
-    looked: [R] each, what ``measure`` returns of the policies before the first update;
-      empty where the evaluation does not ride with it
+    eval_metrics: [R] each, what ``evaluation_metrics`` returns of the policies before the first
+      update; empty where ``advance`` does not evaluate
     """
 
-    made: jax.Array
+    num_updates: jax.Array
     metrics: dict[str, jax.Array]
-    looked: dict[str, jax.Array]
+    eval_metrics: dict[str, jax.Array]
 
 
 def block_of_updates(
-    build_learner: BuildLearner, length: int, visit: Callable[..., EvaluationEpisodes] | None
+    build_learner: BuildLearner,
+    length: int,
+    make_evaluation: Callable[..., EvaluationEpisodes] | None,
 ) -> Callable[..., tuple[RunState, Block]]:
     """Returns a function that makes ``length`` updates of all runs, or fewer if that is the end.
 
@@ -61,62 +63,107 @@ def block_of_updates(
     Args:
       build_learner: called while the settings of one run are traced.
       length: rows of the metrics.
-      visit: (key of an evaluation [], active=whether it is made []) -> its episodes, which are
-        played in one go with those of the first update; None where learners cannot.
+      make_evaluation: (key of an evaluation [], active=whether it is made []) -> its episodes,
+        which are played in one launch with those of the first update; None where learners cannot.
     """
+    update = _update_of_runs(build_learner, make_evaluation)
 
-    def active(state: RunState, budget: Budget) -> jax.Array:
-        used = counts.reached(state.train_states.env_steps, budget.env_steps)
-        return ~(used | counts.reached(state.train_states.num_updates, budget.updates))
+    def advance(
+        state: RunState, budget: Budget, evaluation_due: jax.Array
+    ) -> tuple[RunState, Block]:
+        """Makes the updates, and evaluates before the first; see ``block_of_updates``."""
 
-    def progress(state: RunState, budget: Budget) -> jax.Array:
-        """Returns the share [R] of its budget that each run has used."""
-        env_steps = counts.as_float(state.train_states.env_steps)
-        updates = counts.as_float(state.train_states.num_updates)
-        # No run goes on whose budget is nothing.
-        limits = (counts.as_float(x) for x in budget)
-        one, other = (jnp.maximum(limit, 1.0) for limit in limits)
-        return jnp.minimum(jnp.maximum(env_steps / one, updates / other), 1.0)
+        def unfinished(carry: tuple[RunState, Block]) -> jax.Array:
+            state, block = carry
+            return (block.num_updates < length) & jnp.any(_active(state, budget))
+
+        def body(carry: tuple[RunState, Block]) -> tuple[RunState, Block]:
+            """Makes one update, and writes its metrics as a row."""
+            state, (num_updates, rows, eval_metrics) = carry
+            state, row, measured = update(state, budget, evaluation_due & (num_updates == 0))
+            write = functools.partial(lax.dynamic_update_index_in_dim, index=num_updates, axis=0)
+            # The first update alone evaluates; what the others return as measured is void.
+            eval_metrics = jax.tree.map(
+                lambda x, old: jnp.where(num_updates == 0, x, old), measured, eval_metrics
+            )
+            return state, Block(num_updates + 1, jax.tree.map(write, rows, row), eval_metrics)
+
+        # The loop writes into arrays of a fixed length: XLA knows no others. Rows after the last
+        # update stay zero, so that "active" is False there.
+        _, row, eval_metrics = jax.eval_shape(update, state, budget, evaluation_due)
+        zeros = functools.partial(jax.tree.map, lambda x: jnp.zeros(x.shape, x.dtype))
+        rows = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), row)
+        return lax.while_loop(
+            unfinished, body, (state, Block(jnp.int32(0), rows, zeros(eval_metrics)))
+        )
+
+    return advance
+
+
+def _update_of_runs(
+    build_learner: BuildLearner, make_evaluation: Callable[..., EvaluationEpisodes] | None
+) -> Callable[[RunState, Budget, jax.Array], Any]:
+    """Returns a function that makes one update of all runs; arguments of both as of a block."""
 
     def step(
         state: TrainState,
         settings: dict[str, jax.Array],
-        going: jax.Array,
+        active: jax.Array,
         eval_key: jax.Array,
-        look: jax.Array,
+        evaluation_due: jax.Array,
     ) -> Any:
-        evaluation = None if visit is None else visit(eval_key, active=look)
-        state, metrics, played = step_with(build_learner(settings), state, going, evaluation)
-        looked = {} if evaluation is None or played is None else measure(played, evaluation)
-        return state, metrics | {"active": going}, looked
+        """Makes one update of one run, and evaluates the policy before it.
+
+        Returns its state, its metrics, and what the evaluation measured; nothing without one.
+        """
+        evaluation = None
+        if make_evaluation is not None:
+            evaluation = make_evaluation(eval_key, active=evaluation_due)
+        state, metrics, trajectory = step_with(build_learner(settings), state, active, evaluation)
+        eval_metrics = {}
+        # Without a shared launch there are no episodes of the evaluation.
+        if evaluation is not None and trajectory is not None:
+            eval_metrics = evaluation_metrics(trajectory, evaluation)
+        return state, metrics | {"active": active}, eval_metrics
 
     @functools.partial(jax.jit, inline=True)  # traced once, for its shapes and for the loop
-    def update(state: RunState, budget: Budget, look: jax.Array) -> Any:
-        before = dataclasses.replace(state.train_states, progress=progress(state, budget))
-        going, looks = active(state, budget), jnp.broadcast_to(look, len(state.eval_keys))
-        train_states, metrics, looked = jax.vmap(step)(
-            before, state.settings, going, state.eval_keys, looks
+    def update(state: RunState, budget: Budget, evaluation_due: jax.Array) -> Any:
+        """Makes one update of all runs [R] that have budget left; results as of ``step``."""
+        # Schedules, such as the learning rate's, go by a share that learners do not know.
+        before = dataclasses.replace(state.train_states, progress=_progress(state, budget))
+        active = _active(state, budget)
+        evaluation_due = jnp.broadcast_to(evaluation_due, len(state.eval_keys))
+        train_states, metrics, eval_metrics = jax.vmap(step)(
+            before, state.settings, active, state.eval_keys, evaluation_due
         )
-        return dataclasses.replace(state, train_states=train_states), metrics, looked
+        return dataclasses.replace(state, train_states=train_states), metrics, eval_metrics
 
-    def advance(state: RunState, budget: Budget, look: jax.Array) -> tuple[RunState, Block]:
-        def unfinished(carry: tuple[RunState, Block]) -> jax.Array:
-            state, block = carry
-            return (block.made < length) & jnp.any(active(state, budget))
+    return update
 
-        def body(carry: tuple[RunState, Block]) -> tuple[RunState, Block]:
-            state, (made, rows, looked) = carry
-            state, row, now = update(state, budget, look & (made == 0))
-            write = functools.partial(lax.dynamic_update_index_in_dim, index=made, axis=0)
-            looked = jax.tree.map(lambda x, old: jnp.where(made == 0, x, old), now, looked)
-            return state, Block(made + 1, jax.tree.map(write, rows, row), looked)
 
-        _, row, looked = jax.eval_shape(update, state, budget, look)
-        zeros = functools.partial(jax.tree.map, lambda x: jnp.zeros(x.shape, x.dtype))
-        rows = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), row)
-        return lax.while_loop(unfinished, body, (state, Block(jnp.int32(0), rows, zeros(looked))))
+def _active(state: RunState, budget: Budget) -> jax.Array:
+    """Returns which runs [R] have not used their budget."""
+    out_of_steps = counts.reached(state.train_states.env_steps, budget.env_steps)
+    return ~(out_of_steps | counts.reached(state.train_states.num_updates, budget.updates))
 
-    return advance
+
+def _progress(state: RunState, budget: Budget) -> jax.Array:
+    """Returns the share [R] of its budget that each run has used."""
+    env_steps = counts.as_float(state.train_states.env_steps)
+    updates = counts.as_float(state.train_states.num_updates)
+    # A budget of 0 would divide by 0. No run with such a budget goes on, so any share will do.
+    max_env_steps = jnp.maximum(counts.as_float(budget.env_steps), 1.0)
+    max_updates = jnp.maximum(counts.as_float(budget.updates), 1.0)
+    return jnp.minimum(jnp.maximum(env_steps / max_env_steps, updates / max_updates), 1.0)
+
+
+def _stop_empty(state: RunState, occupied: jax.Array) -> RunState:
+    """Returns states [R] in which those without a run, not ``occupied`` [R], stand still."""
+    # They count as runs whose budget is used, for which a block of updates does not wait.
+    env_steps = state.train_states.env_steps
+    env_steps = jnp.where(occupied[:, None], env_steps, counts.from_int(MAX_COUNT))
+    train_states = dataclasses.replace(state.train_states, env_steps=env_steps)
+    return dataclasses.replace(state, train_states=train_states)
 
 
 def evaluation_episodes(
@@ -146,7 +193,7 @@ def evaluate(
     active: bool | jax.Array = True,
     sampled: bool = True,
 ) -> dict[str, jax.Array]:
-    """Plays the episodes of an evaluation alone; returns what ``measure`` does.
+    """Plays the episodes of an evaluation alone; returns what ``evaluation_metrics`` does.
 
     Args:
       env: what is played.
@@ -164,8 +211,8 @@ def evaluate(
       >>> env = mr.envs.make("CartPole-v1")
       >>> learner = mr.reinforce(env, num_episodes=4, horizon=20)
       >>> actor = learner.init(jax.random.key(0)).actor
-      >>> found = mr.evaluate(env, learner, actor, jax.random.key(1), num_episodes=4, horizon=20)
-      >>> 1 <= found["eval_return"].item() <= 20
+      >>> metrics = mr.evaluate(env, learner, actor, jax.random.key(1), num_episodes=4, horizon=20)
+      >>> 1 <= metrics["eval_return"].item() <= 20
       True
     """
     evaluation = evaluation_episodes(key, num_episodes=num_episodes, active=active, sampled=sampled)
@@ -180,23 +227,28 @@ def evaluate(
         deterministic=evaluation.deterministic(),
         active=evaluation.active,
     )
-    return measure(trajectory, evaluation) | {"simulated_steps": trajectory.simulated}
+    return evaluation_metrics(trajectory, evaluation) | {"simulated_steps": trajectory.simulated}
 
 
-def measure(trajectory: Trajectory, evaluation: EvaluationEpisodes) -> dict[str, jax.Array]:
+def evaluation_metrics(
+    trajectory: Trajectory, evaluation: EvaluationEpisodes
+) -> dict[str, jax.Array]:
     """Returns what the episodes of an evaluation show.
 
     ``eval_return`` and ``eval_length`` [], means over the deterministic episodes,
     ``eval_return_stochastic`` [], over the sampled ones if there are any, ``eval_steps`` [], the
     steps of all episodes, and ``simulated_steps`` [], those that were simulated for them alone:
-    none where they rode with others. A return is NaN if one of its episodes left the finite
-    numbers: what that earned until then says nothing.
+    none where they shared the launch of others. A return is NaN if one of its episodes left the
+    finite numbers: what that earned until then says nothing.
     """
-    returns, lengths = episode_returns(trajectory), episode_lengths(trajectory)
+    returns = episode_returns(trajectory)
+    lengths = episode_lengths(trajectory)
+    # A return that overflowed says nothing, either.
     returns = jnp.where(trajectory.nonfinite | ~jnp.isfinite(returns), jnp.nan, returns)
     modes = evaluation.num_modes
-    sampled = len(evaluation.keys) > modes
-    stochastic = {"eval_return_stochastic": jnp.mean(returns[modes:])} if sampled else {}
+    stochastic = {}
+    if len(evaluation.keys) > modes:
+        stochastic["eval_return_stochastic"] = jnp.mean(returns[modes:])
     return stochastic | {
         "eval_return": jnp.mean(returns[:modes]),
         "eval_length": jnp.mean(lengths[:modes]),
@@ -213,10 +265,10 @@ class Programs(NamedTuple):
 
     begin: (seed, the numbers [R] of the runs' seeds, settings [R] each) -> the first states, and
       the data of the keys [K, R] of the last test, which plays the episodes of K evaluations
-    advance: (states, the parts of a ``Budget``, which rows have a run [R], whether to evaluate [])
+    advance: (states, the fields of a ``Budget``, which rows have a run [R], whether to evaluate [])
       -> (states, metrics [K, R] each, what was evaluated [R] each), as in ``Block``
     evaluate: (states, whether to [R]) -> what ``evaluate`` returns, [R] each
-    rides: whether ``advance`` evaluates; else ``evaluate`` does, before it
+    advance_evaluates: whether ``advance`` evaluates; else ``evaluate`` does, before it
     like: the shapes of a ``RunState``
     division: among which devices the runs are divided; R are those of one device
     """
@@ -224,13 +276,32 @@ class Programs(NamedTuple):
     begin: Callable[..., tuple[jax.Array, jax.Array]]
     advance: Callable[..., tuple[jax.Array, dict[str, jax.Array], dict[str, jax.Array]]]
     evaluate: Callable[..., dict[str, jax.Array]]
-    rides: bool
+    advance_evaluates: bool
     like: RunState
     division: Division = ALONE
 
 
 #: The metrics that say how far a run is, and which of its updates broke.
 _COUNTED = ("active", "env_steps", "nonfinite_episodes", "skipped_update")
+
+
+def _states_of_runs(build_learner: BuildLearner) -> Callable[..., RunState]:
+    """Returns a function of a root, the seeds' numbers [R] and the settings [R] of runs."""
+
+    def first_state(key: jax.Array, settings: dict[str, jax.Array]) -> TrainState:
+        return build_learner(settings).init(key)
+
+    # One program, whatever the seeds are: a program for each operation on keys takes longer.
+    def states(seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]) -> RunState:
+        """Returns the states of R runs before their first update."""
+        keys = seed_keys(seed, numbers)
+        return RunState(
+            train_states=jax.vmap(first_state)(keys, settings),
+            eval_keys=eval_keys(numbers),
+            settings=settings,
+        )
+
+    return states
 
 
 def programs_of(
@@ -241,7 +312,7 @@ def programs_of(
     num_runs: int,
     traced: Collection[str] = (),
     *,
-    whole: bool = True,
+    all_metrics: bool = True,
     division: Division = ALONE,
 ) -> Programs:
     """Returns the programs of runs.
@@ -253,54 +324,50 @@ def programs_of(
       config: the settings, in which those that are traced stand for any value.
       num_runs: R, of the shapes; those of one device.
       traced: the names of the settings that differ from run to run.
-      whole: whether all is measured that ``metrics.csv`` has. Else evaluations play the policy's
-        mode alone, and of the metrics those of ``_COUNTED`` are returned.
+      all_metrics: whether all is measured that ``metrics.csv`` has. Else evaluations play the
+        policy's mode alone, and of the metrics those of ``_COUNTED`` are returned.
       division: among which devices the runs are divided.
     """
     learner = build_learner({})  # policies and engines are those of any
-    rides = isinstance(learner.play, SharedLaunch) and config.training_horizon(horizon) == horizon
+    # A launch has one horizon, and an evaluation plays to that of the environment.
+    advance_evaluates = (
+        isinstance(learner.play, SharedLaunch) and config.training_horizon(horizon) == horizon
+    )
 
-    def first(key: jax.Array, settings: dict[str, jax.Array]) -> TrainState:
-        return build_learner(settings).init(key)
-
-    # One program, whatever the seeds are: a program for each operation on keys takes longer.
-    def states(seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]) -> RunState:
-        keys = seed_keys(seed, numbers)
-        return RunState(
-            train_states=jax.vmap(first)(keys, settings),
-            eval_keys=eval_keys(numbers),
-            settings=settings,
-        )
+    states = _states_of_runs(build_learner)
 
     def begin(seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]) -> Any:
         rows = layout.traced_rows(states(seed, numbers, settings))
         return rows, plain(last_test_keys(numbers, config))
 
-    size: Any = {"num_episodes": config.eval_episodes, "sampled": whole}
-    visit = functools.partial(evaluation_episodes, **size)
+    size: Any = {"num_episodes": config.eval_episodes, "sampled": all_metrics}
+    make_evaluation = functools.partial(evaluation_episodes, **size)
     play = functools.partial(evaluate, env, learner, horizon=horizon, **size)
 
-    def look_at(rows: jax.Array, which: jax.Array) -> dict[str, jax.Array]:
-        now = layout.traced_states(rows)
-        return jax.vmap(play)(now.train_states.actor, now.eval_keys, active=which)
+    def evaluate_rows(rows: jax.Array, chosen: jax.Array) -> dict[str, jax.Array]:
+        state = layout.traced_states(rows)
+        return jax.vmap(play)(state.train_states.actor, state.eval_keys, active=chosen)
 
-    updates = block_of_updates(build_learner, config.block_length, visit if rides else None)
+    updates = block_of_updates(
+        build_learner, config.block_length, make_evaluation if advance_evaluates else None
+    )
 
     def advance(
-        rows: jax.Array, budget: Sequence[jax.Array], which: jax.Array, look: jax.Array
+        rows: jax.Array, budget: Sequence[jax.Array], occupied: jax.Array, evaluation_due: jax.Array
     ) -> Any:
-        before = layout.traced_states(rows)
-        # A row without a run has no budget.
-        played = before.train_states.env_steps
-        played = jnp.where(which[:, None], played, counts.from_int(MAX_COUNT))
-        train_states = dataclasses.replace(before.train_states, env_steps=played)
-        before = dataclasses.replace(before, train_states=train_states)
-        after, (_, metrics, looked) = updates(before, Budget(*budget), which & look)
-        measured = metrics if whole else {name: metrics[name] for name in _COUNTED}
-        return layout.traced_rows(after), measured, looked
+        """Makes a block of updates of rows; those without a run are not ``occupied`` [R]."""
+        before = _stop_empty(layout.traced_states(rows), occupied)
+        after, (_, metrics, eval_metrics) = updates(
+            before, Budget(*budget), occupied & evaluation_due
+        )
+        # A sweep records no more, and what is returned is fetched of each of its runs.
+        if not all_metrics:
+            metrics = {name: metrics[name] for name in _COUNTED}
+        return layout.traced_rows(after), metrics, eval_metrics
 
+    # The functions above read ``layout`` when they are traced, which is later.
     numbers = jax.ShapeDtypeStruct((num_runs,), np.uint32)
     settings = {name: jax.ShapeDtypeStruct((num_runs,), jnp.result_type(float)) for name in traced}
     like = jax.eval_shape(states, np.uint32(0), numbers, settings)
     layout = StateRows(like)
-    return Programs(begin, advance, look_at, rides, like, division)
+    return Programs(begin, advance, evaluate_rows, advance_evaluates, like, division)

@@ -21,19 +21,34 @@ class Measured(NamedTuple):
 
     runs: [n] their numbers, the least first
     metrics: [K, n] each, what ``block_of_updates`` measured in at most K updates; empty without any
-    looked: [n] each, what ``programs.evaluate`` returns of the policies before; empty without any
+    eval_metrics: [n] each, what ``programs.evaluate`` returns of the policies before; empty without
+      any
     """
 
     runs: np.ndarray
     metrics: Arrays
-    looked: Arrays
+    eval_metrics: Arrays
 
 
 COLUMNS = (
-    *("seed", "update", "episodes", "env_steps", "wall_seconds"),
-    *("train_return", "eval_return", "eval_return_stochastic", "eval_length", "train_length"),
-    *("entropy", "gradient_norm", "nonfinite_episodes", "skipped_update"),
-    *("kl", "policy_std", "explained_variance", "gradient_snr"),
+    "seed",
+    "update",
+    "episodes",
+    "env_steps",
+    "wall_seconds",
+    "train_return",
+    "eval_return",
+    "eval_return_stochastic",
+    "eval_length",
+    "train_length",
+    "entropy",
+    "gradient_norm",
+    "nonfinite_episodes",
+    "skipped_update",
+    "kl",
+    "policy_std",
+    "explained_variance",
+    "gradient_snr",
 )
 HEADER = (",".join(COLUMNS) + "\n").encode()
 #: What these columns are called among the metrics of an update.
@@ -49,15 +64,15 @@ def as_rows(measured: Arrays, seconds: float) -> Arrays:
       seconds: wall time since compilation ended.
     """
     clock = np.full(len(measured["seed"]), round(seconds, 3))
-    named = {column: measured.get(_RENAMED.get(column, column)) for column in COLUMNS}
-    return {n: x for n, x in named.items() if x is not None} | {"wall_seconds": clock}
+    columns = {column: measured.get(_RENAMED.get(column, column)) for column in COLUMNS}
+    return {n: x for n, x in columns.items() if x is not None} | {"wall_seconds": clock}
 
 
 def lines(rows: Arrays) -> bytes:
     """Returns rows as metrics.csv has them; cells of what was not measured are empty."""
-    empty = [""] * len(rows["seed"])
-    columns = (_cells(rows[name]) if name in rows else empty for name in COLUMNS)
-    return "".join(",".join(row) + "\n" for row in zip(*columns, strict=True)).encode()
+    columns = {name: [""] * len(rows["seed"]) for name in COLUMNS}
+    columns |= {name: _cells(rows[name]) for name in COLUMNS if name in rows}
+    return "".join(",".join(row) + "\n" for row in zip(*columns.values(), strict=True)).encode()
 
 
 def _cells(values: np.ndarray) -> Sequence[str]:
@@ -143,8 +158,9 @@ def broken_in_a_row(before: np.ndarray, metrics: Arrays) -> np.ndarray:
     broken = metrics["nonfinite_episodes"] >= metrics["episodes"]
     broken |= metrics["skipped_update"] > 0
     count = before
-    for active_now, broken_now in zip(metrics["active"], broken, strict=True):
-        count = np.where(active_now, np.where(broken_now, count + 1, 0), count)
+    # One row [S] an update. A seed that stands still keeps its count: it was not tried.
+    for active_row, broken_row in zip(metrics["active"], broken, strict=True):
+        count = np.where(active_row, np.where(broken_row, count + 1, 0), count)
     return count
 
 
@@ -157,24 +173,26 @@ def describe_nonfinite(met: np.ndarray, first_seed: int, updates: int) -> str:
       updates: how many there were after the block.
     """
     seeds = (first_seed + np.flatnonzero(met)).tolist()
-    named = ", ".join(map(str, seeds[:_NAMED])) + (", ..." if len(seeds) > _NAMED else "")
-    numbers = "number" if len(seeds) == 1 else "numbers"
+    numbers = ", ".join(map(str, seeds[:_NAMED]))
+    if len(seeds) > _NAMED:
+        numbers += ", ..."
+    noun = "number" if len(seeds) == 1 else "numbers"
     return (
-        f"up to update {updates}, {len(seeds):,} of {len(met):,} seeds ({numbers} {named}) met "
+        f"up to update {updates}, {len(seeds):,} of {len(met):,} seeds ({noun} {numbers}) met "
         "values that are not finite or beyond 1e10. Such an episode counts as the worst of its "
         "update. This line comes once; the number of such updates comes at the end. If they are "
         "many, give the model a smaller timestep or more armature, or lower --learning-rate"
     )
 
 
-def _joined(blocks: Sequence[Arrays]) -> Arrays:
-    """Returns the rows of all blocks, in order."""
-    names = blocks[0] if blocks else ()
-    return {name: np.concatenate([block[name] for block in blocks]) for name in names}
+def _joined(pieces: Sequence[Arrays]) -> Arrays:
+    """Returns the rows of all pieces of a table, in order."""
+    names = pieces[0] if pieces else ()
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
 
 
 class Record:
-    """What R runs have measured so far, such as a part of a sweep's.
+    """What R runs have measured so far, such as a chunk of a sweep's.
 
     updates: [R] int64, how many each has made
     env_steps: [R] int64, how many each has played in training
@@ -184,21 +202,25 @@ class Record:
     lengths: [R] int64, of a sweep, the steps of all its episodes
     """
 
-    #: What a checkpoint has besides the tables.
-    _kept: tuple[str, ...] = ("updates", "env_steps", "nonfinite", "returns", "seen", "lengths")
+    #: What a checkpoint has besides the tables, under these names.
+    _saved: tuple[str, ...] = ("updates", "env_steps", "nonfinite", "returns", "seen", "lengths")
 
     def __init__(self, config: Config):
         """Begins before the first update; R is ``config.num_seeds``."""
-        self.config, self.returns = config, np.zeros(config.num_seeds, np.float32)
-        counts = np.zeros((5, config.num_seeds), np.int64)
-        self.updates, self.env_steps, self.nonfinite, self.lengths, self.seen = counts
-        self.seen -= 1
-        #: Name -> blocks of rows: named columns, [rows, ...] each.
+        num_runs = config.num_seeds
+        self.config = config
+        self.returns = np.zeros(num_runs, np.float32)
+        self.updates = np.zeros(num_runs, np.int64)
+        self.env_steps = np.zeros(num_runs, np.int64)
+        self.nonfinite = np.zeros(num_runs, np.int64)
+        self.lengths = np.zeros(num_runs, np.int64)
+        self.seen = np.full(num_runs, -1, np.int64)
+        #: Name -> pieces of the table, in order: named columns, [rows, ...] each.
         self._tables: dict[str, list[Arrays]] = {"evaluations": []}
 
     def arrays(self) -> Arrays:
         """Returns all that was measured, by name, for ``restore``."""
-        arrays = {name: np.array(getattr(self, name)) for name in self._kept}
+        arrays = {name: np.array(getattr(self, name)) for name in self._saved}
         for table in self._tables:
             arrays |= {f"{table}.{name}": x for name, x in self._columns(table).items()}
         return arrays
@@ -209,19 +231,22 @@ class Record:
         Args:
           arrays: from its ``arrays``.
         """
-        for name in self._kept:
-            value = arrays[name]
-            setattr(self, name, value.copy() if value.ndim else value.item())
+        # Counts change in place, so they are copied; without an axis they were Python's ints.
+        for name in self._saved:
+            values = arrays[name]
+            setattr(self, name, values.copy() if values.ndim else values.item())
+        # A table that had no rows has no columns, either.
         for table in self._tables:
             start = f"{table}."
-            named = {n.removeprefix(start): x for n, x in arrays.items() if n.startswith(start)}
-            self._tables[table] = [named] if named else []
+            columns = {n.removeprefix(start): x for n, x in arrays.items() if n.startswith(start)}
+            self._tables[table] = [columns] if columns else []
 
     def _columns(self, table: str) -> Arrays:
         """Returns all rows of a table."""
-        whole = _joined(self._tables[table])
-        self._tables[table] = [whole] if whole else []
-        return dict(whole)
+        columns = _joined(self._tables[table])
+        # They stay joined: who asks after every evaluation would else join all of them each time.
+        self._tables[table] = [columns] if columns else []
+        return dict(columns)
 
     def begun(self) -> bool:
         """Returns whether there is an evaluation."""
@@ -236,7 +261,7 @@ class Record:
         return used(self.config, self.env_steps, self.updates)
 
     def used_up(self) -> float:
-        """Returns how many whole budgets the runs have used together."""
+        """Returns how many budgets of one run the runs have used together."""
         return np.minimum(self.used(), 1.0).sum()
 
     def finished(self) -> bool:
@@ -261,11 +286,16 @@ class Record:
         Returns:
           Its rows in metrics.csv, which a sweep has not.
         """
-        runs, metrics, looked = measured
-        made = np.any(metrics["active"], axis=0) if metrics else np.ones(len(runs), bool)
-        runs = runs[made]
-        self.returns[runs], self.seen[runs] = looked["eval_return"][made], self.env_steps[runs]
-        self.lengths[runs] = looked["eval_steps"][made]
+        runs, metrics, eval_metrics = measured
+        # A run whose budget is used stands still. It is evaluated when all have ended, with no
+        # block; until then it keeps its last evaluation, so that its rows depend on no other run.
+        active = np.ones(len(runs), bool)
+        if metrics:
+            active = np.any(metrics["active"], axis=0)
+        runs = runs[active]
+        self.returns[runs] = eval_metrics["eval_return"][active]
+        self.seen[runs] = self.env_steps[runs]
+        self.lengths[runs] = eval_metrics["eval_steps"][active]
         self._append(eval_return=self.returns, env_steps=self.seen)
         return {}
 
@@ -276,7 +306,8 @@ class Record:
     def add_updates(self, measured: Measured) -> np.ndarray:
         """Takes in a block of updates; returns what ``nonfinite_updates`` does."""
         runs, metrics, _ = measured
-        active, met = metrics["active"], nonfinite_updates(metrics)
+        active = metrics["active"]
+        met = nonfinite_updates(metrics)
         self.updates[runs] += active.sum(axis=0)
         steps = np.where(active, metrics["env_steps"], 0)
         self.env_steps[runs] += steps.sum(axis=0, dtype=np.int64)
@@ -287,15 +318,23 @@ class Record:
         """Returns which runs [R] have not used their budget, and how long their episodes are."""
         return self.used() < 1.0, self.lengths
 
-    def measure(self, fraction: float, seconds: float, gained: float, passed: float) -> Progress:
+    def progress_at(
+        self, fraction: float, seconds: float, gained: float, passed: float
+    ) -> Progress:
         """Returns how far the runs are.
 
         Args:
           fraction: how much of their budgets they have used.
           seconds: in which they did that.
-          gained: the part of the fraction from which the time left is estimated.
-          passed: seconds in which that was gained.
+          gained: how much of the fraction was new, for an estimate of the time left.
+          passed: seconds in which that came.
         """
+        env_steps_per_second = math.nan
+        if seconds > 0:
+            env_steps_per_second = float(self.env_steps.sum() / seconds)
+        seconds_left = math.nan
+        if gained > 0:
+            seconds_left = (1 - fraction) * passed / gained
         return Progress(
             fraction=fraction,
             updates=int(self.updates.max()),
@@ -304,8 +343,8 @@ class Record:
             worst=float(self.returns.min()),
             failed=int(np.sum(~np.isfinite(self.returns))),
             num_seeds=len(self.returns),
-            env_steps_per_second=float(self.env_steps.sum() / seconds) if seconds > 0 else math.nan,
-            seconds_left=(1 - fraction) * passed / gained if gained > 0 else math.nan,
+            env_steps_per_second=env_steps_per_second,
+            seconds_left=seconds_left,
         )
 
     def history(self) -> Arrays:
@@ -326,7 +365,7 @@ class RunRecord(Record):
     threshold: the return that counts as solved, if any
     """
 
-    _kept = (*Record._kept, "episodes", "broken_in_a_row", "simulated", "evaluated")
+    _saved = (*Record._saved, "episodes", "broken_in_a_row", "simulated", "evaluated")
 
     def __init__(self, config: Config, threshold: float | None):
         """Begins before the first update.
@@ -336,13 +375,18 @@ class RunRecord(Record):
           threshold: the return that counts as solved, if any.
         """
         super().__init__(config)
-        self.threshold, num_seeds = threshold, config.num_seeds
-        self.episodes, self.broken_in_a_row = np.zeros((2, num_seeds), np.int64)
-        self.simulated = self.evaluated = 0
-        kinds = {"episode_return": np.float32, "env_steps": np.int64, "episodes": np.int64}
-        first = {name: np.zeros((0, num_seeds), kind) for name, kind in kinds.items()}
+        num_seeds = config.num_seeds
+        self.threshold = threshold
+        self.episodes = np.zeros(num_seeds, np.int64)
+        self.broken_in_a_row = np.zeros(num_seeds, np.int64)
+        # Python's ints, which do not overflow: both are sums over all seeds and all updates.
+        self.simulated = 0
+        self.evaluated = 0
+        # A run that ends before its first update has these columns without rows.
+        dtypes = {"episode_return": np.float32, "env_steps": np.int64, "episodes": np.int64}
+        no_rows = {name: np.zeros((0, num_seeds), dtype) for name, dtype in dtypes.items()}
         #: "last" has one row, the metrics of each seed's last update.
-        self._tables |= {"training": [first], "last": []}
+        self._tables |= {"training": [no_rows], "last": []}
 
     def moved(self) -> tuple[None, None]:
         """Returns None for all: a seed whose budget is used is still evaluated."""
@@ -360,16 +404,18 @@ class RunRecord(Record):
           What ``nonfinite_updates`` does.
         """
         metrics = measured.metrics
-        active, finite = metrics["active"], metrics["nonfinite_episodes"] == 0
+        active = metrics["active"]
+        finite = metrics["nonfinite_episodes"] == 0
         returns = np.where(finite, metrics["episode_return"], np.nan)
-        played, steps = active * metrics["episodes"], metrics["env_steps"]
+        episodes = active * metrics["episodes"]
         training = {
             "episode_return": np.where(active, returns, np.nan),
-            "env_steps": self.env_steps + np.cumsum(steps, axis=0, dtype=np.int64),
-            "episodes": self.episodes + np.cumsum(played, axis=0, dtype=np.int64),
+            "env_steps": self.env_steps + np.cumsum(metrics["env_steps"], axis=0, dtype=np.int64),
+            "episodes": self.episodes + np.cumsum(episodes, axis=0, dtype=np.int64),
         }
-        made = active.any(axis=1)
-        self._tables["training"].append({name: x[made] for name, x in training.items()})
+        # The last block may end early: rows in which no seed made an update are none.
+        updates = active.any(axis=1)
+        self._tables["training"].append({name: x[updates] for name, x in training.items()})
         self.episodes = training["episodes"][-1]
         self.simulated += _sum(metrics["simulated_steps"])
         self.broken_in_a_row = broken_in_a_row(self.broken_in_a_row, metrics)
@@ -378,11 +424,14 @@ class RunRecord(Record):
 
     def _remember(self, metrics: Arrays) -> None:
         """Keeps each seed's metrics of its last update; a seed that stands still makes none."""
-        made = metrics["active"].sum(axis=0)
-        last = np.maximum(made - 1, 0)[None]
+        # A seed makes its updates first and then stands still, so their count is the row after the
+        # last one.
+        num_updates = metrics["active"].sum(axis=0)
+        last = np.maximum(num_updates - 1, 0)[None]
         newest = {name: np.take_along_axis(x, last, axis=0) for name, x in metrics.items()}
         old = self._columns("last") or newest
-        self._tables["last"] = [{n: np.where(made > 0, x, old[n]) for n, x in newest.items()}]
+        moved = num_updates > 0
+        self._tables["last"] = [{n: np.where(moved, x, old[n]) for n, x in newest.items()}]
 
     def add_evaluation(self, measured: Measured, seconds: float) -> Arrays:
         """Takes in an evaluation [S] of the present policies of all seeds.
@@ -394,29 +443,39 @@ class RunRecord(Record):
         Returns:
           Its rows in metrics.csv.
         """
-        looked, seeds = measured.looked, self.config.first_seed + np.arange(len(self.updates))
+        eval_metrics = measured.eval_metrics
         counts = {"env_steps": self.env_steps, "episodes": self.episodes}
-        self._append(**looked, **counts, updates=self.updates, seconds=np.array(seconds))
-        self.add_test(looked)
-        self.returns, self.seen = looked["eval_return"], self.env_steps.copy()
+        self._append(**eval_metrics, **counts, updates=self.updates, seconds=np.array(seconds))
+        self.count_steps(eval_metrics)
+        self.returns = eval_metrics["eval_return"]
+        self.seen = self.env_steps.copy()
+        # Columns of metrics.csv are singular: a row is of one update of one seed.
+        seeds = self.config.first_seed + np.arange(len(self.updates))
         counts |= {"seed": seeds, "update": self.updates}
         last = {name: x[0] for name, x in self._columns("last").items()}
-        return as_rows(last | looked | counts, seconds)
+        return as_rows(last | eval_metrics | counts, seconds)
 
     def progress(self) -> Progress:
         """Returns how far the run is, right after an evaluation."""
-        names, rows = ("env_steps", "updates", "seconds"), self._tables["evaluations"][-_LATEST:]
-        latest = _joined([{name: block[name][-_LATEST:] for name in names} for block in rows])
-        past = {name: x[-_LATEST:] for name, x in latest.items()}
-        counted = used(self.config, past["env_steps"], past["updates"])
-        fractions = np.minimum(counted, 1.0).mean(axis=-1).tolist()
-        now, seconds = fractions[-1], past["seconds"].tolist()
-        return self.measure(now, seconds[-1], now - fractions[0], seconds[-1] - seconds[0])
+        names = ("env_steps", "updates", "seconds")
+        # A piece may have one row or all of the past: each is cut, then they are joined and cut.
+        pieces = self._tables["evaluations"][-_LATEST:]
+        joined = _joined([{name: piece[name][-_LATEST:] for name in names} for piece in pieces])
+        latest = {name: x[-_LATEST:] for name, x in joined.items()}
+        fractions = used(self.config, latest["env_steps"], latest["updates"])
+        fractions = np.minimum(fractions, 1.0).mean(axis=-1).tolist()
+        seconds = latest["seconds"].tolist()
+        return self.progress_at(
+            fraction=fractions[-1],
+            seconds=seconds[-1],
+            gained=fractions[-1] - fractions[0],
+            passed=seconds[-1] - seconds[0],
+        )
 
-    def add_test(self, looked: Arrays) -> None:
-        """Counts what an evaluation or a test simulated, of ``programs.evaluate``."""
-        self.simulated += _sum(looked["simulated_steps"])
-        self.evaluated += _sum(looked["eval_steps"])
+    def count_steps(self, eval_metrics: Arrays) -> None:
+        """Counts the steps of an evaluation or a test, of what ``programs.evaluate`` returns."""
+        self.simulated += _sum(eval_metrics["simulated_steps"])
+        self.evaluated += _sum(eval_metrics["eval_steps"])
 
     def over(self) -> bool:
         """Returns whether the budget is used, or nothing is finite any more."""
@@ -424,8 +483,9 @@ class RunRecord(Record):
 
     def hopeless(self) -> bool:
         """Returns whether all seeds that still train were broken throughout a block of updates."""
-        training, block = self.used() < 1.0, max(self.config.eval_every, _FEWEST)
-        return bool(training.any() and np.all(self.broken_in_a_row[training] >= block))
+        training = self.used() < 1.0
+        fewest = max(self.config.eval_every, _FEWEST)
+        return bool(training.any() and np.all(self.broken_in_a_row[training] >= fewest))
 
     def training(self) -> Arrays:
         """Returns ``episode_return`` and the ``env_steps`` and ``episodes`` after it, [U, S].

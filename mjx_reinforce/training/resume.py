@@ -1,8 +1,8 @@
 """Going on: what was begun, by which program, and the checkpoints to which it goes back.
 
 A checkpoint is a run between two blocks of updates, a NumPy archive in RUN/checkpoint/. Each is
-written whole, under a name that ends in the beginning of its SHA-256: a file that was cut off or
-changed is noticed, and the one before it is used. The newest two are kept, and the newest one that
+written in full, under a name that ends in the beginning of its SHA-256: a file that was cut off or
+changed is noticed, and the one before it is used. The newest two stay, and the newest one that
 is even, for runs whose budget is raised.
 """
 
@@ -30,13 +30,20 @@ BUDGETS = marked(Mark.BUDGET)
 PLACES = marked(Mark.PLACE)
 #: Entries of config.json on which every number of a run depends, besides its settings.
 _PROGRAM = (
-    *("packages", "git_commit", "device", "cpu", "cores", "machine_code", "jax_settings"),
-    *("x64", "xla_flags"),
+    "packages",
+    "git_commit",
+    "device",
+    "cpu",
+    "cores",
+    "machine_code",
+    "jax_settings",
+    "x64",
+    "xla_flags",
 )
 #: Entries that no number depends on.
-_BESIDE = ("python", "num_devices", "cpu_count", "resumed")
+_NOT_DECISIVE = ("python", "num_devices", "cpu_count", "resumed")
 _DEVICES = "--xla_force_host_platform_device_count"
-_OTHER = "damaged, or of another version of the program; resume with the version that wrote it"
+_UNREADABLE = "damaged, or of another version of the program; resume with the version that wrote it"
 
 
 #: The first file of a run, and that of a sweep.
@@ -53,6 +60,7 @@ def read_record(directory: Path) -> dict[str, Any]:
         try:
             return read_json(directory / name)
         except ValueError as error:
+            # A file that is there and damaged is no reason to look for the other one.
             if not isinstance(error.__cause__, FileNotFoundError):
                 raise
     raise ValueError(
@@ -63,15 +71,18 @@ def read_record(directory: Path) -> dict[str, Any]:
 
 def as_config(recorded: Mapping[str, Any], path: Path) -> Config:
     """Returns the settings that a file recorded, or raises ValueError, which names the file."""
-    kinds = {f.name: f.type for f in dataclasses.fields(Config) if f.name not in PLACES}
-    if odd := sorted((recorded.keys() - {*_PROGRAM, *_BESIDE, *PLACES}) ^ kinds.keys()):
-        raise ValueError(f"{path} has other settings ({odd[0]}): it is {_OTHER}")
+    types = {f.name: f.type for f in dataclasses.fields(Config) if f.name not in PLACES}
+    recorded_names = recorded.keys() - {*_PROGRAM, *_NOT_DECISIVE, *PLACES}
+    # Neither a setting too many nor one too few: a default of today may not be that of then.
+    if mismatched := sorted(recorded_names ^ types.keys()):
+        raise ValueError(f"{path} has other settings ({mismatched[0]}): it is {_UNREADABLE}")
     settings: dict[str, Any] = {}
-    for name, kind in kinds.items():
+    for name, annotation in types.items():
         value = recorded[name]
+        # JSON has no tuples, and no setting is a list.
         settings[name] = tuple(value) if isinstance(value, list) else value
-        if not fits(settings[name], kind):
-            raise ValueError(f"{path} says {name} is {value!r}: it is {_OTHER}")
+        if not fits(settings[name], annotation):
+            raise ValueError(f"{path} says {name} is {value!r}: it is {_UNREADABLE}")
     return Config(**settings)
 
 
@@ -86,42 +97,49 @@ def decisive(config: Config) -> dict[str, Any]:
     return {name: value for name, value in recordable(config).items() if name not in BUDGETS}
 
 
-def check_settings(known: Config, asked: Config) -> None:
+def check_settings(recorded: Config, requested: Config) -> None:
     """Raises ValueError if more than the budget of a run is to change.
 
     Args:
-      known: the run's settings.
-      asked: those that the command line asks for.
+      recorded: the run's settings.
+      requested: those that the command line asks for.
     """
-    if asked.output is not None:
+    if requested.output is not None:
         raise ValueError("--resume goes on in the run's own directory: leave --output out")
-    if asked.like is not None:
+    if requested.like is not None:
         raise ValueError("--resume goes on with the run's own settings: leave --like out")
     for field in dataclasses.fields(Config):
-        old, new = getattr(known, field.name), getattr(asked, field.name)
+        old = getattr(recorded, field.name)
+        new = getattr(requested, field.name)
         if old != new and field.name not in (*BUDGETS, *PLACES):
             raise ValueError(
-                f"{flag(field.name)} is {old} in {known.resume} and cannot become {new}: only "
+                f"{flag(field.name)} is {old} in {recorded.resume} and cannot become {new}: only "
                 "its budget may change; leave it out, or start another run"
             )
 
 
-def is_done(known: Config, asked: Config) -> bool:
+def is_done(recorded: Config, requested: Config) -> bool:
     """Returns whether a run has finished and is asked for no more than it did.
+
+    Arguments are those of ``check_settings``.
 
     Raises:
       ValueError: it is asked for no more, and was stopped because nothing was finite any more.
     """
-    assert known.resume is not None
+    assert recorded.resume is not None
+    # How often a run is saved decides nothing of where it ends.
     ends = (name for name in BUDGETS if name != "checkpoint_every")
-    if any(getattr(known, name) != getattr(asked, name) for name in ends):
+    if any(getattr(recorded, name) != getattr(requested, name) for name in ends):
         return False
+    # A run without a summary, or with a damaged one, did not get to its end.
     try:
-        summary = read_json(known.resume / "summary.json")
+        summary = read_json(recorded.resume / "summary.json")
     except ValueError:
         return False
     if summary.get("status") == "stopped":
-        raise ValueError(f"{known.resume} was stopped and would be again: {summary.get('reason')}")
+        raise ValueError(
+            f"{recorded.resume} was stopped and would be again: {summary.get('reason')}"
+        )
     return summary.get("status") == "finished"
 
 
@@ -136,13 +154,18 @@ def check_same_program(
       present: what ``provenance`` returns.
     """
     for name in (name for name in _PROGRAM if name in present):
-        old, new = recorded.get(name), present[name]
+        old = recorded.get(name)
+        new = present[name]
         if name == "xla_flags":
-            old, new = _without_devices(old), _without_devices(new)
+            old = _without_devices(old)
+            new = _without_devices(new)
+        # Of versions and JAX's settings the message names the first one that differs.
         if isinstance(old, dict) and isinstance(new, dict):
-            changed = [key for key in {**old, **new} if old.get(key) != new.get(key)]
-            if changed:
-                name, old, new = changed[0], old.get(changed[0]), new.get(changed[0])
+            changed_keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+            if changed_keys:
+                name = changed_keys[0]
+                old = old.get(name)
+                new = new.get(name)
         if old != new:
             raise ValueError(
                 f"{directory} was begun with {name} {old}, and here it is {new}, so its numbers "
@@ -152,11 +175,11 @@ def check_same_program(
 
 def _without_devices(flags: object) -> str:
     """Returns XLA_FLAGS without the number of a CPU's devices, with which a run may go on."""
-    kept = (x for x in str(flags or "").split() if not x.startswith(f"{_DEVICES}="))
-    return " ".join(kept)
+    words = str(flags or "").split()
+    return " ".join(word for word in words if not word.startswith(f"{_DEVICES}="))
 
 
-_KEPT = 2
+_NUM_NEWEST = 2
 _NAME = re.compile(r"\d{6,}-(even-)?[0-9a-f]{16}\.npz")
 
 
@@ -211,10 +234,11 @@ def save(folder: Path, checkpoint: Checkpoint, *, even: bool) -> None:
     number = max((_number(path) for path in _archives(folder)), default=0) + 1
     name = f"{number:06d}-{'even-' if even else ''}{_digest(content)}.npz"
     write_bytes(folder / name, content)
-    files = _archives(folder)
-    kept = files[:_KEPT] + [path for path in files if "-even-" in path.name][:1]
-    for path in files:
-        if path not in kept:
+    # Two, in case the newest one is damaged. The even one is what a larger budget goes on from.
+    paths = _archives(folder)
+    live_paths = paths[:_NUM_NEWEST] + [path for path in paths if "-even-" in path.name][:1]
+    for path in paths:
+        if path not in live_paths:
             path.unlink()
 
 
@@ -226,7 +250,7 @@ def read_checkpoints(folder: Path, say: Callable[[str], None]) -> Iterator[Check
       say: shows a line about each damaged file.
 
     Raises:
-      ValueError: a checkpoint is whole, but of another version of the program.
+      ValueError: a checkpoint is undamaged, but of another version of the program.
     """
     for path in _archives(folder):
         content = _read(path)
@@ -237,10 +261,12 @@ def read_checkpoints(folder: Path, say: Callable[[str], None]) -> Iterator[Check
 
 
 def remove_checkpoints(folder: Path, after: int = 0) -> None:
-    """Removes the checkpoints after a number, parts of unwritten ones, and a folder left empty."""
-    parts = folder.glob(".*.npz.*")
-    for path in [*parts, *(path for path in _archives(folder) if _number(path) > after)]:
+    """Removes the checkpoints after a number, leftovers of writing, and a folder left empty."""
+    unfinished = folder.glob(".*.npz.*")
+    later = (path for path in _archives(folder) if _number(path) > after)
+    for path in [*unfinished, *later]:
         path.unlink()
+    # A folder with checkpoints in it stays: ``rmdir`` refuses.
     with contextlib.suppress(OSError):
         folder.rmdir()
 
@@ -275,12 +301,12 @@ _ROWS = ("states", "best")
 
 def _encode(checkpoint: Checkpoint) -> bytes:
     """Returns a NumPy archive: the rows, the record's arrays, and the rest as JSON."""
-    rest = checkpoint._asdict()
-    record = {f"record/{name}": values for name, values in rest.pop("record").items()}
-    rows = {name: rest.pop(name) for name in _ROWS}
-    del rest["number"]
+    fields = checkpoint._asdict()
+    record = {f"record/{name}": values for name, values in fields.pop("record").items()}
+    rows = {name: fields.pop(name) for name in _ROWS}
+    del fields["number"]  # it is in the file's name
     archive = io.BytesIO()
-    np.savez(archive, allow_pickle=False, rest=np.array(json.dumps(rest)), **rows, **record)
+    np.savez(archive, allow_pickle=False, rest=np.array(json.dumps(fields)), **rows, **record)
     return archive.getvalue()
 
 
@@ -289,10 +315,11 @@ def _decode(content: bytes, path: Path) -> Checkpoint:
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-        rest = json.loads(str(arrays.pop("rest")))
+        fields = json.loads(str(arrays.pop("rest")))
         rows = {name: arrays.pop(name) for name in _ROWS}
         record = {name.removeprefix("record/"): x for name, x in arrays.items()}
-        return Checkpoint(record=record, number=_number(path), **rows, **rest)
+        # Another version's fields are no arguments of this class: TypeError.
+        return Checkpoint(record=record, number=_number(path), **rows, **fields)
     except (KeyError, TypeError, zipfile.BadZipFile, ValueError) as error:
         raise ValueError(
             f"{path} does not fit this version of the program ({error}); "
@@ -316,17 +343,23 @@ def newest_checkpoint(config: Config, say: Callable[[str], None]) -> Checkpoint 
     assert config.resume is not None
     metrics = config.resume / "metrics.csv"
     length = metrics.stat().st_size if metrics.exists() else 0
-    for found in read_checkpoints(config.resume / "checkpoint", say):
-        for name, value in (found.settings or {}).items():
-            if (said := decisive(config).get(name)) != value:
+    settings = decisive(config)
+    for checkpoint in read_checkpoints(config.resume / "checkpoint", say):
+        # config.json is a file that people edit; a checkpoint is not.
+        for name, value in (checkpoint.settings or {}).items():
+            if settings.get(name) != value:
                 raise ValueError(
-                    f"{config.resume}/config.json says that {name} is {said}, but the run was "
-                    f"trained with {value}; put that back, or start another run"
+                    f"{config.resume}/config.json says that {name} is {settings.get(name)}, but "
+                    f"the run was trained with {value}; put that back, or start another run"
                 )
-        if found.metrics_bytes > length:
-            say(f"metrics.csv is shorter than at checkpoint {found.number}; trying the one before")
-        elif _serves(found, config):
-            return found
+        # Rows are cut off down to a checkpoint's length; rows that are lost cannot come back.
+        if checkpoint.metrics_bytes > length:
+            say(
+                f"metrics.csv is shorter than at checkpoint {checkpoint.number}; trying the one "
+                "before"
+            )
+        elif _serves(checkpoint, config):
+            return checkpoint
     if config.minutes is not None:
         raise ValueError(
             f"{config.resume} has no checkpoint to go on from for {config.minutes:g} min; leave "
@@ -335,7 +368,7 @@ def newest_checkpoint(config: Config, say: Callable[[str], None]) -> Checkpoint 
     return None
 
 
-def _serves(found: Checkpoint, config: Config) -> bool:
+def _serves(checkpoint: Checkpoint, config: Config) -> bool:
     """Returns whether a run with this budget passes through a checkpoint.
 
     One with a budget in time goes on from any: it is no other run's equal.
@@ -343,15 +376,15 @@ def _serves(found: Checkpoint, config: Config) -> bool:
     Raises:
       ValueError: the budget is smaller than what it has used.
     """
-    if (found.env_steps, found.max_updates) == (config.env_steps, config.max_updates):
+    if (checkpoint.env_steps, checkpoint.max_updates) == (config.env_steps, config.max_updates):
         return True
-    for name, budget, used in (
-        ("env_steps", config.env_steps, found.record["env_steps"].max()),
-        ("max_updates", config.max_updates, found.record["updates"].max()),
+    for name, budget, minimum in (
+        ("env_steps", config.env_steps, checkpoint.record["env_steps"].max()),
+        ("max_updates", config.max_updates, checkpoint.record["updates"].max()),
     ):
-        if budget is not None and budget < used:
+        if budget is not None and budget < minimum:
             raise ValueError(
-                f"{flag(name)} {budget} is less than the {used} of the run so far; give at least "
-                "that"
+                f"{flag(name)} {budget} is less than the {minimum} of the run so far; give at "
+                "least that"
             )
-    return config.minutes is not None or found.is_even(config.eval_every)
+    return config.minutes is not None or checkpoint.is_even(config.eval_every)

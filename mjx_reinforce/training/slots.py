@@ -41,14 +41,17 @@ def pack_slots(chosen: np.ndarray, lengths: np.ndarray, width: int, num_devices:
       num_devices: among which a slot is divided; each gets as many runs as the others, or one less.
 
     Returns:
-      [slots, width], the number of the run in each lane, -1 where there is none.
+      [slots, width], the number of the run in each place, -1 where there is none.
     """
     runs = np.flatnonzero(chosen)
+    # A slot takes as long as its longest episode: runs of about equal lengths share one.
     runs = runs[np.argsort(lengths[runs], kind="stable")]
-    lanes = np.full((-(-len(runs) // width), width), -1)
-    lanes.flat[: len(runs)] = runs
-    dealt = lanes.reshape(len(lanes), width // num_devices, num_devices)
-    return dealt.swapaxes(1, 2).reshape(lanes.shape)
+    slots = np.full((-(-len(runs) // width), width), -1)
+    slots.flat[: len(runs)] = runs
+    # A device has a contiguous share of a slot. Runs are dealt to the devices in turn, so that the
+    # empty places of the last slot are not all of one device.
+    by_device = slots.reshape(len(slots), width // num_devices, num_devices)
+    return by_device.swapaxes(1, 2).reshape(slots.shape)
 
 
 @dataclasses.dataclass
@@ -70,9 +73,9 @@ class Stopwatch:
 
     def wait(self, compile: Callable[[], Any]) -> Any:
         """Returns a program, compiled here or elsewhere."""
-        began = time.perf_counter()
+        start = time.perf_counter()
         program = compile()
-        self.compiling += time.perf_counter() - began
+        self.compiling += time.perf_counter() - start
         return program
 
 
@@ -89,8 +92,9 @@ class Compiled(NamedTuple):
 
     begin: (seed, the numbers [W] of the runs' seeds, settings [W] each) -> the first states [W, B],
       and the data of the keys [K, W] of the last test
-    advance: (states [W, B], budget, which lanes have a run [W], whether to evaluate []) -> (states
-      [W, B], metrics [K, W] each, what was evaluated [W] each, if that rides), as in ``Measured``
+    advance: (states [W, B], budget, which places have a run [W], whether to evaluate []) -> (states
+      [W, B], metrics [K, W] each, what was evaluated [W] each, if it evaluates), as in
+      ``Measured``
     evaluate: (states [W, B], which [W]) -> what ``programs.evaluate`` returns [W] each
     width: W, the runs of a slot
     programs: that were compiled
@@ -123,22 +127,29 @@ class Slots:
           numbers: [R] of the runs' seeds.
           settings: [R] each, those that differ from run to run, if any do.
         """
-        self._compiled, self._rides = compiled, compiled.programs.rides
-        self._division, self.layout = compiled.programs.division, StateRows(compiled.programs.like)
+        programs = compiled.programs
+        division = programs.division
+        self._compiled = compiled
+        self._advance_evaluates = programs.advance_evaluates
+        self._division = division
+        self.layout = StateRows(programs.like)
         self.budget = Budget.of(compiled.config.env_steps, compiled.config.max_updates)
-        width, count = compiled.width, len(numbers)
-        kind = jnp.result_type(float)
-        given = {name: x.astype(kind) for name, x in (settings or {}).items()}
-        seed = self._division.put(np.uint32(compiled.config.seed), NONE)
-        begun = []
+        width = compiled.width
+        count = len(numbers)
+        dtype = jnp.result_type(float)
+        settings = {name: values.astype(dtype) for name, values in (settings or {}).items()}
+        seed = division.put(np.uint32(compiled.config.seed), NONE)
+        first_slots = []
+        # The last slot may be wider than what is left of the runs: its last run fills it up, and
+        # is cut off again below. The order of runs changes nothing: each has its number's keys.
         for start in range(0, count, width):
-            lanes = np.minimum(np.arange(start, start + width), count - 1)
-            own = self._division.put({name: x[lanes] for name, x in given.items()})
-            placed = self._division.put(numbers[lanes].astype(np.uint32))
-            begun.append(compiled.begin(seed, placed, own))
-        rows, keys = zip(*jax.device_get(begun), strict=True)
+            runs = np.minimum(np.arange(start, start + width), count - 1)
+            slot_settings = division.put({name: values[runs] for name, values in settings.items()})
+            slot_numbers = division.put(numbers[runs].astype(np.uint32))
+            first_slots.append(compiled.begin(seed, slot_numbers, slot_settings))
+        rows, keys = zip(*jax.device_get(first_slots), strict=True)
         self._rows = np.concatenate(rows)[:count]
-        #: The lanes of a slot alone, and its states after the last block.
+        #: The runs of a slot alone, and its states after the last block.
         self._placed: tuple[np.ndarray, jax.Array] | None = None
         self._test_keys = np.concatenate(keys, axis=1)[:, :count]
 
@@ -152,87 +163,118 @@ class Slots:
 
     def restore(self, states: RunState | np.ndarray) -> None:
         """Takes other states of these runs, or rows of them."""
-        rows = states.copy() if isinstance(states, np.ndarray) else self.layout.rows(states)
-        self._rows, self._placed = rows, None
+        if isinstance(states, np.ndarray):
+            self._rows = states.copy()
+        else:
+            self._rows = self.layout.rows(states)
+        self._placed = None  # what is on the device is of the old states
 
     def advance(
         self,
         chosen: np.ndarray | None = None,
         lengths: np.ndarray | None = None,
         *,
-        look: bool = True,
-        most: int = 1,
+        evaluate: bool = True,
+        max_blocks: int = 1,
     ) -> list[Measured]:
         """Evaluates runs and makes a block of updates, several times.
 
         Args:
           chosen: [R] which of them, at least one; all by default.
           lengths: [R] about how long their episodes are, see ``pack_slots``.
-          look: whether to evaluate before the first block.
-          most: how many blocks, where a slot holds these runs. Else they are packed again after
-            one.
+          evaluate: whether to evaluate before the first block.
+          max_blocks: how many blocks, where a slot holds these runs. Else they are packed again
+            after one.
 
         Returns:
           What was measured in each block in which a run made an update.
         """
-        lanes, programs = self._pack(chosen, lengths), self._compiled
-        count = most if len(lanes) == 1 else 1
+        slots = self._pack(chosen, lengths)
+        programs = self._compiled
+        num_blocks = max_blocks if len(slots) == 1 else 1
         budget = self._division.put(tuple(self.budget), NONE)
 
         def move(runs: np.ndarray) -> Any:
-            slot, which = self._put(runs), self._division.put(runs >= 0)
-            blocks, looks = [], look
-            for _ in range(count):  # the host does not wait for any
-                alone = programs.evaluate(slot, which) if looks and not self._rides else {}
-                asked = self._division.put(np.bool_(looks), NONE)
-                slot, metrics, riding = programs.advance(slot, budget, which, asked)
-                blocks.append((metrics, alone | (riding if looks else {})))
-                looks = True
-            return slot, *jax.device_get((slot, blocks))
+            """Moves one slot; returns its states on the device, on the host, and its blocks."""
+            states = self._put(runs)
+            occupied = self._division.put(runs >= 0)
+            blocks = []
+            evaluation_due = evaluate
+            # Calls return before the device is done, and nothing here reads a result: the device
+            # goes from block to block without waiting for the host, which fetches all at the end.
+            for _ in range(num_blocks):
+                eval_metrics = {}
+                if evaluation_due and not self._advance_evaluates:
+                    eval_metrics = programs.evaluate(states, occupied)
+                flag = self._division.put(np.bool_(evaluation_due), NONE)
+                states, metrics, launch_metrics = programs.advance(states, budget, occupied, flag)
+                # Without an evaluation a program returns its arrays all the same, and they say
+                # nothing.
+                if evaluation_due:
+                    eval_metrics |= launch_metrics
+                blocks.append((metrics, eval_metrics))
+                evaluation_due = True  # the block has changed the policies
+            return states, *jax.device_get((states, blocks))
 
-        placed, rows, blocks = zip(*_side_by_side(move, lanes), strict=True)
-        for runs, moved in zip(lanes, rows, strict=True):
-            self._rows[runs[runs >= 0]] = moved[runs >= 0]
-        self._placed = (lanes[0], placed[0]) if len(lanes) == 1 else None
-        every = [_of_slots(lanes, slots) for slots in zip(*blocks, strict=True)]
-        return [measured for measured in every if measured.metrics["active"].any()]
+        placed, rows, blocks = zip(*_side_by_side(move, slots), strict=True)
+        for runs, slot_rows in zip(slots, rows, strict=True):
+            self._rows[runs[runs >= 0]] = slot_rows[runs >= 0]
+        # The states of a slot alone stay on the device: the next block has the same runs.
+        self._placed = (slots[0], placed[0]) if len(slots) == 1 else None
+        # A slot has its blocks one after the other; a block is joined over its slots. Blocks after
+        # the end of all runs made no update.
+        joined = [_of_slots(slots, block) for block in zip(*blocks, strict=True)]
+        return [measured for measured in joined if measured.metrics["active"].any()]
 
     def seconds_to_evaluate(self) -> float:
-        """Returns how long an evaluation takes (s) that does not ride with the updates."""
-        began = time.perf_counter()
-        return 0.0 if self._rides or not self.evaluate() else time.perf_counter() - began
+        """Returns how long an evaluation takes (s) that shares no launch with the updates."""
+        if self._advance_evaluates:
+            return 0.0
+        start = time.perf_counter()
+        self.evaluate()
+        return time.perf_counter() - start
 
     def evaluate(self) -> Measured:
         """Evaluates the present policies of all runs."""
-        lanes, programs = self._pack(), self._compiled
+        slots = self._pack()
+        programs = self._compiled
 
-        def look(runs: np.ndarray) -> Any:
-            which = self._division.put(runs >= 0)
-            return {}, jax.device_get(programs.evaluate(self._put(runs), which))
+        def evaluate_slot(runs: np.ndarray) -> Any:
+            occupied = self._division.put(runs >= 0)
+            return {}, jax.device_get(programs.evaluate(self._put(runs), occupied))
 
-        return _of_slots(lanes, _side_by_side(look, lanes))
+        return _of_slots(slots, _side_by_side(evaluate_slot, slots))
 
     def test(self, actor: Actor) -> Arrays:
         """Returns what ``programs.evaluate`` does of policies [R, ...], on starts of their own.
 
-        There are ``test_episodes`` of them, rounded up to whole evaluations.
+        There are ``test_episodes`` of them, rounded up to a multiple of ``eval_episodes``.
         """
-        kept, every = self._rows, []
+        rows = self._rows
         states = self.states()
-        tested = dataclasses.replace(states.train_states, actor=actor)
+        train_states = dataclasses.replace(states.train_states, actor=actor)
+        evaluations = []
+        # The compiled evaluation reads its policies and keys from the states: for the test they
+        # have these, and are put back afterwards.
         for keys in map(jax.random.wrap_key_data, self._test_keys):
-            self.restore(dataclasses.replace(states, train_states=tested, eval_keys=keys))
-            every.append(self.evaluate().looked)
-        self._rows, self._placed = kept, None
-        return {
-            name: (np.sum if name.endswith("steps") else np.mean)([x[name] for x in every], axis=0)
-            for name in every[0]
-        }
+            self.restore(dataclasses.replace(states, train_states=train_states, eval_keys=keys))
+            evaluations.append(self.evaluate().eval_metrics)
+        self._rows = rows
+        self._placed = None
+        test_metrics = {}
+        for name in evaluations[0]:
+            average = np.sum if name.endswith("steps") else np.mean
+            test_metrics[name] = average([evaluation[name] for evaluation in evaluations], axis=0)
+        return test_metrics
 
     def _put(self, runs: np.ndarray) -> jax.Array:
         """Returns the states of a slot's runs, on the device."""
-        if self._placed is not None and np.array_equal(self._placed[0], runs):
-            return self._placed[1]
+        if self._placed is not None:
+            placed_runs, placed_states = self._placed
+            if np.array_equal(placed_runs, runs):
+                return placed_states
+        # An empty place, -1, has the states of the last run: some that are valid. Programs are told
+        # which places have a run, and what comes out of the others is left out.
         return self._division.put(self._rows[runs])
 
     def _pack(
@@ -240,18 +282,22 @@ class Slots:
     ) -> np.ndarray:
         """Returns the runs of each slot."""
         num_runs = len(self._rows)
-        chosen = np.ones(num_runs, bool) if chosen is None else chosen
-        lengths = np.zeros(num_runs) if lengths is None else lengths
+        if chosen is None:
+            chosen = np.ones(num_runs, bool)
+        if lengths is None:
+            lengths = np.zeros(num_runs)
         return pack_slots(chosen, lengths, self._compiled.width, self._division.seeds)
 
 
-def _side_by_side(move: Callable[[np.ndarray], Any], lanes: np.ndarray) -> list[Any]:
+def _side_by_side(move: Callable[[np.ndarray], Any], slots: np.ndarray) -> list[Any]:
     """Returns the results for all slots [slots, width], as many at once as there are cores.
 
-    A slot alone leaves a part of the cores waiting for each other, and its results are fetched
+    A slot alone leaves some of the cores waiting for each other, and its results are fetched
     while the next one is moved.
     """
-    return [move(lanes[0])] if len(lanes) == 1 else list(_threads().map(move, lanes))
+    if len(slots) == 1:
+        return [move(slots[0])]
+    return list(_threads().map(move, slots))
 
 
 @functools.cache
@@ -260,15 +306,21 @@ def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(num_cores())
 
 
-def _of_slots(lanes: np.ndarray, slots: Sequence[tuple[Arrays, Arrays]]) -> Measured:
-    """Returns a block, its runs in order, from the metrics and the evaluations of its slots."""
-    runs = lanes.reshape(-1)
+def _of_slots(slots: np.ndarray, measured: Sequence[tuple[Arrays, Arrays]]) -> Measured:
+    """Returns a block, its runs in order, from the metrics and the evaluations of its slots.
+
+    Args:
+      slots: [slots, width] the runs of each, -1 where there is none.
+      measured: for each slot its metrics and its evaluation, [..., width] each.
+    """
+    runs = slots.reshape(-1)
+    # Empty places, -1, are sorted to the front and cut off.
     order = np.argsort(runs, kind="stable")[np.sum(runs < 0) :]
-    metrics, looked = (
-        {name: np.concatenate([x[name] for x in each], axis=-1)[..., order] for name in each[0]}
-        for each in zip(*slots, strict=True)
+    metrics, eval_metrics = (
+        {name: np.concatenate([x[name] for x in kind], axis=-1)[..., order] for name in kind[0]}
+        for kind in zip(*measured, strict=True)
     )
-    return Measured(runs[order], metrics, looked)
+    return Measured(runs[order], metrics, eval_metrics)
 
 
 def compile_slots(programs: Programs, config: Config, width: int) -> Compiled:
@@ -282,43 +334,45 @@ def compile_slots(programs: Programs, config: Config, width: int) -> Compiled:
     Raises:
       ValueError: a slot does not fit into memory.
     """
-    division, layout = programs.division, StateRows(programs.like)
-    check_room(2.0 * width * layout.size)
-    beginning = started(functools.partial(_compile_begin, programs, width))
-    rows, which = division.put((np.zeros((width, layout.size), np.uint8), np.zeros(width, bool)))
-    nothing, no_look = division.put((tuple(Budget.of(0, 0)), np.bool_(False)), NONE)
-    given = rows, nothing, which, no_look
-    specs = (RUNS, NONE, RUNS, NONE), (RUNS, SECOND, RUNS)
-    looking = division.jit(programs.evaluate, (RUNS, RUNS), RUNS).lower(rows, which)
-    evaluating = started(functools.partial(executable, looking))
-    updating = division.jit(programs.advance, *specs, by_episodes=True).lower(*given)
-    advancing = started(functools.partial(executable, updating))
-    advance, evaluate = advancing.result(), evaluating.result()
+    division = programs.division
+    size = StateRows(programs.like).size
+    check_room(2.0 * width * size)  # the states before a block of updates, and after it
+    rows, occupied = division.put((np.zeros((width, size), np.uint8), np.zeros(width, bool)))
+    no_budget, no_evaluation = division.put((tuple(Budget.of(0, 0)), np.bool_(False)), NONE)
+    # XLA compiles without Python's lock: while one program compiles in a thread, the next one is
+    # traced here.
+    begin_task = started(functools.partial(_compile_begin, programs, width))
+    evaluate_jit = division.jit(programs.evaluate, (RUNS, RUNS), RUNS)
+    evaluate_lowered = evaluate_jit.lower(rows, occupied)
+    evaluate_task = started(functools.partial(executable, evaluate_lowered))
+    advance_jit = division.jit(
+        programs.advance, (RUNS, NONE, RUNS, NONE), (RUNS, SECOND, RUNS), by_episodes=True
+    )
+    advance_lowered = advance_jit.lower(rows, no_budget, occupied, no_evaluation)
+    advance_task = started(functools.partial(executable, advance_lowered))
+    advance = advance_task.result()
+    evaluate = evaluate_task.result()
     check_fits(advance)
     check_fits(evaluate)
-    # No run: a GPU's driver translates the kernels of a program when it first runs.
-    jax.block_until_ready(advance(*given))
-    return Compiled(beginning.result(), advance, evaluate, width, programs, config)
-
-
-def compile_run(programs: Programs, config: Config) -> Slots:
-    """Returns the seeds of a run before the first update, in one slot."""
-    compiled = compile_slots(programs, config, programs.division.lanes(config.num_seeds))
-    return Slots(compiled, config.first_seed + np.arange(config.num_seeds))
+    # Without a run: a GPU's driver translates the kernels of a program when it first runs.
+    jax.block_until_ready(advance(rows, no_budget, occupied, no_evaluation))
+    return Compiled(begin_task.result(), advance, evaluate, width, programs, config)
 
 
 def _compile_begin(programs: Programs, width: int) -> Callable[..., Any]:
     """Compiles ``Compiled.begin``."""
     division = programs.division
     seed = division.shapes(jax.ShapeDtypeStruct((), np.uint32), NONE)
-    numbers = jax.ShapeDtypeStruct((width,), np.uint32)
-    given = division.shapes((numbers, shape_of_all(programs.like, width).settings), RUNS)
+    numbers = division.shapes(jax.ShapeDtypeStruct((width,), np.uint32), RUNS)
+    settings = division.shapes(shape_of_all(programs.like, width).settings, RUNS)
     program = division.jit(programs.begin, (NONE, RUNS, RUNS), (RUNS, SECOND))
-    return executable(program.lower(seed, *given))
+    return executable(program.lower(seed, numbers, settings))
 
 
 def check_fits(program: jax.stages.Compiled) -> None:
     """Raises ValueError if a program's arrays need more memory than there is."""
-    if (found := program.memory_analysis()) is not None:
-        arrays = found.argument_size_in_bytes + found.output_size_in_bytes
-        check_room(arrays + found.temp_size_in_bytes - found.alias_size_in_bytes)
+    memory = program.memory_analysis()
+    if memory is None:  # not every backend knows
+        return
+    arrays = memory.argument_size_in_bytes + memory.output_size_in_bytes
+    check_room(arrays + memory.temp_size_in_bytes - memory.alias_size_in_bytes)

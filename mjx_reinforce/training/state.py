@@ -48,7 +48,8 @@ class Budget(NamedTuple):
     @classmethod
     def of(cls, env_steps: int | None, updates: int | None) -> "Budget":
         """Returns a budget, of which what has no limit has the greatest count."""
-        return cls(*(counts.from_int(MAX_COUNT if x is None else x) for x in (env_steps, updates)))
+        limits = (MAX_COUNT if limit is None else limit for limit in (env_steps, updates))
+        return cls(*map(counts.from_int, limits))
 
 
 def shape_of_all(like: RunState, num_runs: int) -> RunState:
@@ -74,8 +75,8 @@ class StateRows:
     @property
     def layout(self) -> str:
         """What is in a row, in short: rows of another layout are others' states."""
-        known = repr((self._structure, self._shapes, self._types))
-        return hashlib.sha256(known.encode()).hexdigest()
+        description = repr((self._structure, self._shapes, self._types))
+        return hashlib.sha256(description.encode()).hexdigest()
 
     def rows(self, states: PyTree) -> np.ndarray:
         """Returns the rows of states, on the host."""
@@ -84,13 +85,17 @@ class StateRows:
 
     def states(self, rows: np.ndarray) -> Any:
         """Returns the states of rows, on the host in memory of their own, and their keys."""
-        parts = (part.copy() for part in np.split(rows, self._ends, axis=1))
-        return self._shaped(part.view(kind) for part, kind in zip(parts, self._types, strict=True))
+        # Bytes are read as another type where they lie together: a column of rows is copied first.
+        columns = (column.copy() for column in np.split(rows, self._ends, axis=1))
+        return self._shaped(
+            column.view(dtype) for column, dtype in zip(columns, self._types, strict=True)
+        )
 
     def traced_rows(self, states: PyTree) -> jax.Array:
         """Returns the rows of states, in a program."""
 
         def as_bytes(leaf: jax.Array) -> jax.Array:
+            # XLA has no bitcast of booleans, and bytes need none.
             if leaf.dtype.itemsize == 1:
                 return _flat(leaf.astype(jnp.uint8))
             return _flat(lax.bitcast_convert_type(leaf, jnp.uint8))
@@ -100,14 +105,16 @@ class StateRows:
     def traced_states(self, rows: jax.Array) -> Any:
         """Returns the states of rows, in a program."""
 
-        def read(part: jax.Array, kind: np.dtype) -> jax.Array:
-            if kind.itemsize == 1:
-                return part.astype(kind)
-            numbers = part.reshape(len(part), part.shape[1] // kind.itemsize, kind.itemsize)
-            return lax.bitcast_convert_type(numbers, kind)
+        def read(column: jax.Array, dtype: np.dtype) -> jax.Array:
+            if dtype.itemsize == 1:
+                return column.astype(dtype)
+            # A bitcast to a wider type takes the bytes of a number from the last axis.
+            width = column.shape[1] // dtype.itemsize
+            numbers = column.reshape(len(column), width, dtype.itemsize)
+            return lax.bitcast_convert_type(numbers, dtype)
 
-        parts = jnp.split(rows, self._ends, axis=1)
-        return self._shaped(read(*each) for each in zip(parts, self._types, strict=True))
+        columns = jnp.split(rows, self._ends, axis=1)
+        return self._shaped(map(read, columns, self._types))
 
     def _shaped(self, leaves: Iterable[np.ndarray] | Iterable[jax.Array]) -> Any:
         """Returns states of leaves [R, numbers], which have the data of keys."""
@@ -139,6 +146,8 @@ class Best(struct.PyTreeNode, kw_only=True):
 def first_best(train_states: TrainState) -> Best:
     """Returns the state before the first evaluation, in memory of its own."""
     actor, num_updates = jax.tree.map(np.array, (train_states.actor, train_states.num_updates))
+    # Any return is better, also -inf: of equals the later counts. In JAX's type of floats, which
+    # is that of evaluations.
     worst = np.full(len(num_updates), -np.inf, jnp.result_type(float))
     return Best(actor=actor, eval_return=worst, num_updates=num_updates)
 
@@ -150,6 +159,7 @@ def keep_best(best: Best, present: Best) -> Best:
       best: so far.
       present: those of an evaluation; a return that is not a number is never the best.
     """
+    # A NaN is no better than anything.
     better = present.eval_return >= best.eval_return
 
     def choose(new: np.ndarray, old: np.ndarray) -> np.ndarray:
@@ -170,6 +180,7 @@ def eval_keys(numbers: jax.Array | np.ndarray) -> jax.Array:
 
 def last_test_keys(numbers: jax.Array | np.ndarray, config: Config) -> jax.Array:
     """Returns the keys [K, R] of the last test, which plays the episodes of K evaluations."""
+    # The programs play ``eval_episodes`` at once, and no others are compiled for the test.
     rounds = -(-(config.test_episodes or config.eval_episodes) // config.eval_episodes)
     keys = jax.random.split(_root_key(_EVALUATION_ROOT, domain=2), rounds)
     return jax.vmap(_for_each_seed, in_axes=(0, None))(keys, numbers)
@@ -215,16 +226,18 @@ def last_actors(config: Config, policy: Mapping[str, Any]) -> Actor:
     assert config.init_from is not None
     directory = Path(config.init_from)
     run = read_run(directory)
-    saved = read_policy(policy_folder(run, "last"), trusted_code=config.policy)
+    source = read_policy(policy_folder(run, "last"), trusted_code=config.policy)
+    # Parameters fit only the network, the family and the spaces for which they were trained.
     for name, value in policy.items():
-        old = saved.settings.get(name, value)
+        old = source.settings.get(name, value)
         if name not in _DRAWN and old != value:
             raise ValueError(
                 f"the policies in {directory}, trained on {run.env}, have {name} {old}, and this "
                 f"run {value}; make them agree, or leave --init-from out"
             )
-    seeds = (config.first_seed + np.arange(config.num_seeds)) % saved.num_seeds
-    return jax.tree.map(lambda x: x[seeds], saved.actor)
+    # A run with more seeds than that one begins with some of its policies several times.
+    seeds = (config.first_seed + np.arange(config.num_seeds)) % source.num_seeds
+    return jax.tree.map(lambda x: x[seeds], source.actor)
 
 
 def begin_with(state: RunState, actors: Actor) -> RunState:

@@ -32,14 +32,27 @@ _MANY = 2**19
 #: How the episodes of an update are divided among devices.
 _specs: Any = Trajectory
 _EPISODES = _specs(
-    observation=SECOND, action=SECOND, reward=SECOND, mask=SECOND, nonfinite=RUNS, simulated=NONE
+    observation=SECOND,
+    action=SECOND,
+    reward=SECOND,
+    mask=SECOND,
+    nonfinite=RUNS,
+    simulated=NONE,
 )
 
 #: Metrics without which no run can be recorded.
 _METRICS = (
-    *("episodes", "episode_return", "episode_length", "env_steps", "simulated_steps"),
-    *("nonfinite_episodes", "skipped_update"),
+    "episodes",
+    "episode_return",
+    "episode_length",
+    "env_steps",
+    "simulated_steps",
+    "nonfinite_episodes",
+    "skipped_update",
 )
+
+#: Among the metrics of an update, the episodes of the evaluation that shared its launch.
+_EVALUATION = "evaluation episodes"
 
 
 class EvaluationEpisodes(NamedTuple):
@@ -59,11 +72,22 @@ class EvaluationEpisodes(NamedTuple):
         return jnp.arange(len(self.keys)) < self.num_modes
 
 
+class SharedEpisodes(NamedTuple):
+    """What one launch played.
+
+    training: [T, N] the episodes of an update
+    evaluation: [T, E] those of an evaluation; None without one
+    """
+
+    training: Trajectory
+    evaluation: Trajectory | None
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class SharedLaunch:
     """A ``Learner.play`` whose launch may play an evaluation too, and is divided among devices.
 
-    learner: whose ``play`` takes another rollout, as that of ``reinforce`` does
+    learner: whose ``play`` takes another rollout and returns what that does, see ``RolloutPlay``
     devices: among which the episodes of an update are divided; they stay where they are played, and
       XLA divides what is computed from them. Their count divides every number of episodes that an
       update has room for. None plays where ``jax.jit`` computes
@@ -76,7 +100,7 @@ class SharedLaunch:
         self, state: TrainState, key: jax.Array, active: bool | jax.Array = True
     ) -> Trajectory:
         """Plays the episodes of an update alone."""
-        return self.with_evaluation(state, key, active, None)[0]
+        return self.with_evaluation(state, key, active, None).training
 
     def with_evaluation(
         self,
@@ -84,9 +108,8 @@ class SharedLaunch:
         key: jax.Array,
         active: bool | jax.Array,
         evaluation: EvaluationEpisodes | None,
-    ) -> tuple[Trajectory, Trajectory | None]:
+    ) -> SharedEpisodes:
         """Plays the episodes of an update, and before them those of an evaluation, if any."""
-        evaluated = []
 
         def rollout(
             env: Environment,
@@ -99,31 +122,38 @@ class SharedLaunch:
             horizon: int,
             active: bool | jax.Array,
             limit: jax.Array | None = None,
-        ) -> Trajectory:
+        ) -> SharedEpisodes:
+            """Plays what the learner asks for, and the evaluation, in one launch a device."""
+
             def play(actor: Actor, keys: jax.Array, **options: Any) -> Trajectory:
-                given = env, act, actor, distribution, keys
-                return self.learner.engine.rollout(*given, num_episodes=len(keys), **options)
+                return self.learner.engine.rollout(
+                    env, act, actor, distribution, keys, num_episodes=len(keys), **options
+                )
 
-            part: Any = functools.partial(self._play_part, play, horizon)
-            before, divided = None, None
+            play_share: Any = functools.partial(self._play_share, play, horizon)
+            # In arrays and None, which may be arguments of a function on several devices.
+            evaluation_arrays = None
+            evaluation_specs = None
             if evaluation is not None:
-                before = evaluation.keys, evaluation.deterministic(), evaluation.active
-                divided = _EPISODES
+                evaluation_arrays = evaluation.keys, evaluation.deterministic(), evaluation.active
+                evaluation_specs = _EPISODES
             if self.devices is not None:
-                specs = NONE, NONE, NONE, RUNS, RUNS
-                part = self.devices.map(part, specs, (_EPISODES, divided))
+                # The keys and the choice of the episodes are divided; all devices have the rest.
+                in_specs = NONE, NONE, NONE, RUNS, RUNS
+                out_specs = SharedEpisodes(_EPISODES, evaluation_specs)
+                play_share = self.devices.map(play_share, in_specs, out_specs)
             chosen = jnp.broadcast_to(active, num_episodes)
-            own, its = part(actor, before, limit, keys, chosen)
-            evaluated.append(its)
-            return own
+            return play_share(actor, evaluation_arrays, limit, keys, chosen)
 
-        own, (its,) = self.learner.play(state, key, active, rollout), evaluated
-        if self.devices is not None and evaluation is not None:
-            # Those of the first device; the others played none.
-            its = its.episodes(slice(len(evaluation.keys)))
-        return own, its
+        episodes: SharedEpisodes = self.learner.play(state, key, active, rollout)
+        if self.devices is None or evaluation is None:
+            return episodes
+        assert episodes.evaluation is not None
+        # Those of the first device; the others played none.
+        evaluation_episodes = episodes.evaluation.episodes(slice(len(evaluation.keys)))
+        return episodes._replace(evaluation=evaluation_episodes)
 
-    def _play_part(
+    def _play_share(
         self,
         play: Callable[..., Trajectory],
         horizon: int,
@@ -132,32 +162,42 @@ class SharedLaunch:
         limit: Any,
         keys: Any,
         chosen: Any,
-    ) -> tuple[Trajectory, Trajectory | None]:
+    ) -> SharedEpisodes:
         """Plays episodes of these keys, as far as they are chosen, after those of an evaluation.
 
         They have ``limit`` [] steps at most, an evaluation's those of the horizon. ``evaluation``
         has the keys of its episodes, whether each takes the mode, and whether they are played; None
-        without one. Of several devices each plays a part of the episodes, and the first one the
+        without one. Of several devices each plays a share of the episodes, and the first one the
         evaluation's.
         """
-        count, modes = 0, False
+        count = 0
+        modes = False
         if evaluation is not None:
-            its_keys, its_modes, its_active = evaluation
+            eval_keys, eval_modes, eval_active = evaluation
+            # All devices run one program, so all have room for the evaluation; one plays it.
             if self.devices is not None:
-                its_active = its_active & (self.devices.number() == 0)
-            count = len(its_keys)
-            modes = jnp.concatenate([its_modes, jnp.zeros(len(keys), bool)])
-            chosen = jnp.concatenate([jnp.broadcast_to(its_active, count), chosen])
+                eval_active = eval_active & (self.devices.number() == 0)
+            count = len(eval_keys)
+            # Its episodes come first, so that a slice takes either kind below.
+            modes = jnp.concatenate([eval_modes, jnp.zeros(len(keys), bool)])
+            chosen = jnp.concatenate([jnp.broadcast_to(eval_active, count), chosen])
             if limit is not None:
-                own = jnp.broadcast_to(limit, len(keys))
-                limit = jnp.concatenate([jnp.full(count, horizon), own])
-            keys = jnp.concatenate([its_keys, keys])
-        played = play(actor, keys, horizon=horizon, deterministic=modes, active=chosen, limit=limit)
+                training_limit = jnp.broadcast_to(limit, len(keys))
+                limit = jnp.concatenate([jnp.full(count, horizon), training_limit])
+            keys = jnp.concatenate([eval_keys, keys])
+        episodes = play(
+            actor, keys, horizon=horizon, deterministic=modes, active=chosen, limit=limit
+        )
         if self.devices is not None:
-            played = dataclasses.replace(played, simulated=self.devices.sum(played.simulated))
+            # Each has counted its own; the metrics of an update have the steps of all.
+            simulated = self.devices.sum(episodes.simulated)
+            episodes = dataclasses.replace(episodes, simulated=simulated)
         if evaluation is None:
-            return played, None
-        return played.episodes(slice(count, None)), played.episodes(slice(count))
+            return SharedEpisodes(episodes, None)
+        return SharedEpisodes(
+            training=episodes.episodes(slice(count, None)),
+            evaluation=episodes.episodes(slice(count)),
+        )
 
 
 def step_with(
@@ -167,16 +207,22 @@ def step_with(
     evaluation: EvaluationEpisodes | None,
 ) -> tuple[TrainState, Metrics, Trajectory | None]:
     """Makes one update as ``Learner.step``; also returns the episodes of the evaluation, if any."""
-    launch, evaluated = learner.play, []
+    launch = learner.play
     if evaluation is None or not isinstance(launch, SharedLaunch):
         return *learner.step(state, active), None
 
-    def play(state: TrainState, key: jax.Array, active: bool | jax.Array) -> Trajectory:
-        own, its = launch.with_evaluation(state, key, active, evaluation)
-        evaluated.append(its)
-        return own
+    # ``step`` hands what ``play`` returns to ``learn``, and returns the metrics of ``learn``: the
+    # episodes of the evaluation come out among them, and nothing has learned from these.
+    def learn(
+        state: TrainState, episodes: SharedEpisodes, key: jax.Array
+    ) -> tuple[TrainState, dict[str, Any]]:
+        after, metrics = learner.learn(state, episodes.training, key)
+        return after, metrics | {_EVALUATION: episodes.evaluation}
 
-    return *learner._replace(play=play).step(state, active), *evaluated
+    play = functools.partial(launch.with_evaluation, evaluation=evaluation)
+    after, metrics = learner._replace(play=play, learn=learn).step(state, active)
+    episodes: Any = metrics.pop(_EVALUATION)
+    return after, metrics, episodes
 
 
 def short_episodes(learner: Learner, horizon: int, num_seeds: int, cut_steps: int = 0) -> Learner:
@@ -193,8 +239,11 @@ def short_episodes(learner: Learner, horizon: int, num_seeds: int, cut_steps: in
     def learn(
         state: TrainState, trajectory: Trajectory, key: jax.Array
     ) -> tuple[TrainState, Metrics]:
+        """``Learner.learn``, which passes over ``few`` steps where no episode is longer."""
+        # A second program for short episodes does not pay where updates are small or hardly longer.
         if not CHUNK_STEPS <= few < horizon or num_seeds * trajectory.mask.size < _MANY:
             return learner.learn(state, trajectory, key)
+        # One choice for all seeds: of a choice for each, vmap would compute both.
         return jax.lax.cond(
             any_lane(jnp.any(trajectory.mask[few])),
             lambda: learner.learn(state, trajectory, key),
@@ -212,10 +261,14 @@ def in_one_launch(learner: Learner, devices: Devices | None = None) -> Learner:
       devices: see ``SharedLaunch``.
     """
     launch = SharedLaunch(learner, devices)
+    # Where all episodes start alike, those of an evaluation would too: it is played alone.
     if jax.eval_shape(learner.init, jax.random.key(0)).start_key is not None:
         return learner._replace(play=launch.__call__)
-    # Elsewhere an episode that is not played still takes its place.
-    return learner._replace(play=launch if learner.engine.name == "native" else launch.__call__)
+    # With another engine an episode that is not played takes as long as one that is, and every
+    # update would play the evaluation.
+    if learner.engine.name != "native":
+        return learner._replace(play=launch.__call__)
+    return learner._replace(play=launch)
 
 
 def check_learner(name: str, learner: Learner) -> None:
@@ -226,6 +279,7 @@ def check_learner(name: str, learner: Learner) -> None:
       learner: what it returned. Its functions are traced.
     """
     check_kind(f"what {name} returns", learner, Learner, "mjx_reinforce.reinforce(env)")
+    # Shapes alone: nothing is played.
     state = traced(f"the learner of {name}", learner.init, jax.random.key(0))
     after, metrics = traced(f"the learner of {name}", learner.step, state)
     if _shapes(after) != _shapes(state):
@@ -233,7 +287,7 @@ def check_learner(name: str, learner: Learner) -> None:
             f"learn of the learner of {name} must return a state of the structure, shapes and "
             "dtypes of the one that it gets"
         )
-    if missing := [each for each in _METRICS if each not in metrics]:
+    if missing := [name for name in _METRICS if name not in metrics]:
         raise ValueError(
             f"learn of the learner of {name} must also return the metrics {', '.join(missing)}: "
             "see mjx_reinforce.train_step"

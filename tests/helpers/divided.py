@@ -10,13 +10,13 @@ import sys
 
 import jax
 import numpy as np
+from one_slot import compile_run
 
 from mjx_reinforce import envs
 from mjx_reinforce.engine.base import plain
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup import build, ready
 from mjx_reinforce.training.division import ALONE, Division
-from mjx_reinforce.training.slots import compile_run
 
 SMALL = {"num_seeds": 3, "num_episodes": 8, "hidden_sizes": (4,), "eval_episodes": 2}
 SMALL |= {"env_steps": None, "max_updates": 2, "test_episodes": 4}
@@ -37,15 +37,15 @@ def close(one, other):
 
 def trained(config, division):
     """Returns all that a run comes to, on the host; how much was simulated is each device's own."""
-    prepared = ready.made(envs.make(config.env), config, division=division)
+    prepared = ready.build_ready(envs.make(config.env), config, division=division)
     slots = compile_run(prepared.programs(), config)
-    before, [(_, metrics, looked)], state = slots.states(), slots.advance(), slots.states()
+    before, [(_, metrics, eval_metrics)], state = slots.states(), slots.advance(), slots.states()
     assert all(len(x) == config.num_seeds for x in jax.tree.leaves(plain(state)))
     tested = slots.test(state.train_states.actor)
-    for measured in (metrics, looked, tested):
+    for measured in (metrics, eval_metrics, tested):
         del measured["simulated_steps"]
-    again = slots.evaluate().looked["eval_return"]
-    return jax.device_get(plain((before, state))), metrics, looked, tested, again
+    again = slots.evaluate().eval_metrics["eval_return"]
+    return jax.device_get(plain((before, state))), metrics, eval_metrics, tested, again
 
 
 def stepped(config, division):

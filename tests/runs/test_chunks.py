@@ -11,10 +11,10 @@ CONFIG = Config(num_seeds=4, env_steps=100, max_updates=10)
 
 def measured(runs, returns, lengths, active=(), env_steps=(), broken=()):
     """An evaluation, and the updates after it: [K, n] each."""
-    looked = {"eval_return": np.array(returns), "eval_steps": np.array(lengths)}
+    eval_metrics = {"eval_return": np.array(returns), "eval_steps": np.array(lengths)}
     metrics = {"active": np.array(active, bool), "env_steps": np.array(env_steps, np.int32)}
     metrics |= {"nonfinite_episodes": np.array(broken), "skipped_update": np.array(broken)}
-    return Measured(np.array(runs), metrics if len(active) else {}, looked)
+    return Measured(np.array(runs), metrics if len(active) else {}, eval_metrics)
 
 
 def add(record, measured, seconds):
@@ -55,6 +55,6 @@ def test_measurements_add_up():
 
 def test_progress_is_what_the_runs_have_made_and_last_returned():
     record = filled()
-    now = record.measure(0.5, seconds=2.5, gained=0.25, passed=3.0)
+    now = record.progress_at(0.5, seconds=2.5, gained=0.25, passed=3.0)
     assert record.used().tolist() == pytest.approx([0, 0.6, 0, 1.3])
     assert now == (0.5, 4, 190 / 4, now.iqm, 1, 0, 4, 190 / 2.5, 6)

@@ -81,8 +81,8 @@ def test_every_run_is_in_one_chunk_and_every_chunk_has_its_share(num_chunks):
     runs = [(c, s) for part in parts for c, s in zip(part.configuration, part.seed, strict=True)]
     assert sorted(runs) == [(c, s) for c in (3, 5, 8, 9, 11) for s in range(3)]
     for part in parts:
-        assert np.array_equal(whole.members[part.place], part.configuration)
-        number = np.bincount(part.place, minlength=5)
+        assert np.array_equal(whole.members[part.member], part.configuration)
+        number = np.bincount(part.member, minlength=5)
         assert number.max() - number.min() <= 1
     assert len({part.name for part in parts}) == num_chunks
 

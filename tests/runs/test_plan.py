@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import jax
 import pytest
+from one_slot import compile_run
 from toys import Survive
 
 import mjx_reinforce as mr
@@ -102,7 +103,7 @@ def test_networks_that_do_not_fit_into_memory_are_refused_before_anything_is_wri
     monkeypatch.setattr(devices, "memory_here", lambda: 25e9)
     monkeypatch.setattr(choice, "choose", lambda *_: pytest.fail("an engine is made"))
     with pytest.raises(ValueError, match=r"does not fit into memory: .*lower --num-seeds") as error:
-        ready.made(Survive(), Config(num_episodes=4, horizon=8, **settings), traced=traced)
+        ready.build_ready(Survive(), Config(num_episodes=4, horizon=8, **settings), traced=traced)
     assert f"it needs about {needed} GB, 25 GB are here" in str(error.value)
 
 
@@ -119,7 +120,7 @@ def test_what_is_foretold_of_networks_is_no_more_than_xla_says(monkeypatch, sett
     monkeypatch.setattr(room, "_HOST_STATES", 0)
     monkeypatch.setattr(room, "check_room", foretold.append)
     monkeypatch.setattr(slots, "check_room", said.append)
-    slots.compile_run(ready.made(Survive(), config).programs(), config)
+    compile_run(ready.build_ready(Survive(), config).programs(), config)
     assert max(said) / 3 < foretold[0] <= max(said)
 
 
@@ -134,7 +135,7 @@ def test_a_network_of_python_that_does_not_fit_into_memory_is_refused(monkeypatc
 def test_an_update_of_more_steps_than_are_counted_is_refused():
     config = Config(num_episodes=2**20, horizon=2**11)
     with pytest.raises(ValueError, match=r"2,147,483,648 env steps .* lower --num-episodes or"):
-        ready.made(Survive(), config)
+        ready.build_ready(Survive(), config)
 
 
 @pytest.mark.slow

@@ -166,7 +166,7 @@ def test_numbers_of_shifts_dampings_and_values_are_traced(monkeypatch):
     }
     key = jax.random.key(3)
     monkeypatch.setattr(ready, "programs_of", lambda env, build, *more, **options: build)
-    builder = ready.made(Drift(), group.config, ALONE, tuple(group.settings)).programs()
+    builder = ready.build_ready(Drift(), group.config, ALONE, tuple(group.settings)).programs()
 
     def trained(learner):
         states = jax.lax.scan(lambda x, _: (learner.step(x)[0], None), learner.init(key), None, 2)
@@ -269,7 +269,7 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
     What ended is not trained again, and its report is written if it is not there.
     """
     monkeypatch.setattr(plan, "_CPU_EPISODES", 16)
-    drive, driven, ended, tried = driver.Training.drive, [], [], []
+    drive, driven, ended, tried = driver.Driver.drive, [], [], []
     add, save, write = SweepFiles._write_part, SweepFiles._save_checkpoint, resume.save
 
     def interrupted(*arguments):
@@ -294,7 +294,7 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
         write(*arguments, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(driver.Training, "drive", interrupted)
+        patch.setattr(driver.Driver, "drive", interrupted)
         assert run(f"{CHUNKS} --output parts") == 0
     assert json.loads(Path("parts/sweep.json").read_text())["status"] == "interrupted"
     for name, crash in (
@@ -500,7 +500,7 @@ def test_the_policies_of_the_best_and_the_worst_seed_are_kept(run):
         assert choose_seed(known, "best") == best
         config = Config(env="Drift-v0", num_seeds=5, eval_episodes=2, hidden_sizes=(4,))
         learner, horizon = build(env, config)
-        made = programs_of(env, lambda _, x=learner: x, horizon, config, 1, whole=False)
+        made = programs_of(env, lambda _, x=learner: x, horizon, config, 1, all_metrics=False)
         evaluate, layout = jax.jit(made.evaluate), StateRows(made.like)
         for seed in known.seeds:
             actor = jax.tree.map(lambda x: x[None], load_seed(known, seed)[0].actor)

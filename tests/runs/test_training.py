@@ -4,14 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+from one_slot import compile_run
 
 from mjx_reinforce import envs
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.setup.ready import made
+from mjx_reinforce.setup.ready import build_ready
 from mjx_reinforce.training import driver as module
 from mjx_reinforce.training.driver import Runs, begin_run
 from mjx_reinforce.training.record import HOPELESS
-from mjx_reinforce.training.slots import compile_run
 
 CONFIG = Config(
     env="ContinuousCartPole-v0",
@@ -36,7 +36,7 @@ def begin(ready, config, **more):
 
 @pytest.fixture(scope="module")
 def ready():
-    return made(envs.make(CONFIG.env), CONFIG)
+    return build_ready(envs.make(CONFIG.env), CONFIG)
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ import numpy as np
 import optax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
+from one_slot import compile_run
 from toys import Survive
 
 from mjx_reinforce import envs
@@ -25,7 +26,6 @@ from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.gpu import seam as gpu
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup import compile_times, ready
-from mjx_reinforce.training.slots import compile_run
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=4000, eval_episodes=2)
 
@@ -43,7 +43,7 @@ def filled(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(objects, "folder", lambda: made)
         patch.setattr(machine, "_LOADED", {})  # as in a process that has loaded nothing
-        return made, numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
+        return made, numbers(ready.load_or_build_ready(CONFIG, CONFIG), CONFIG)
 
 
 @pytest.fixture
@@ -60,8 +60,8 @@ def numbers(prepared, config):
     """
     slots, measured = compile_run(prepared.programs(), config), []
     for _ in range(2):
-        [(_, metrics, looked)] = slots.advance()
-        measured += [metrics, looked, slots.evaluate().looked]
+        [(_, metrics, eval_metrics)] = slots.advance()
+        measured += [metrics, eval_metrics, slots.evaluate().eval_metrics]
     state = slots.states().train_states
     leaves = [jax.random.key_data(state.key), state.env_steps, *jax.tree.leaves(state.actor)]
     measured.append(slots.test(state.actor))
@@ -74,12 +74,12 @@ def numbers(prepared, config):
 def test_a_second_start_traces_nothing_and_gives_the_same(monkeypatch):
     settings = {"estimator": "value-baseline", "optimizer": "sgd", "decay_steps": None}
     config = dataclasses.replace(CONFIG, **settings)
-    plain = ready.made(envs.make(config.env), config)
-    first = ready.get_ready(config, config)
+    plain = ready.build_ready(envs.make(config.env), config)
+    first = ready.load_or_build_ready(config, config)
     expected = numbers(first, config)
     with monkeypatch.context() as patch:
         patch.setattr(envs, "make", lambda *_: pytest.fail("the environment was built"))
-        second = ready.get_ready(config, config)
+        second = ready.load_or_build_ready(config, config)
         assert jax.tree.structure(second.programs().like) == jax.tree.structure(
             plain.programs().like
         )
@@ -144,7 +144,7 @@ def test_a_program_whose_kernel_is_gone_is_not_read():
     name = gpu._target("0" * 64).encode()
     for each in ("facts", *ready._PROGRAMS):
         cache.Cache.find().write(f"key-{each}", name if each == "advance" else b"{}")
-    assert ready.read_ready("key") is None
+    assert ready.load_ready("key") is None
 
 
 def test_a_commit_that_changes_no_source_changes_nothing(monkeypatch):
@@ -158,11 +158,11 @@ def test_resumed_runs_and_other_seeds_find_their_programs(expected, monkeypatch)
     """A config.json has the time limit, which the command line had left out."""
     monkeypatch.setattr(envs, "make", lambda *_: pytest.fail("the environment was built"))
     resumed = dataclasses.replace(CONFIG, horizon=500, resume=Path("run"), env_steps=999)
-    assert ready.get_ready(resumed, CONFIG).horizon == 500
+    assert ready.load_or_build_ready(resumed, CONFIG).horizon == 500
     with pytest.raises(pytest.fail.Exception, match="was built"):
-        ready.get_ready(dataclasses.replace(resumed, horizon=400), CONFIG)
+        ready.load_or_build_ready(dataclasses.replace(resumed, horizon=400), CONFIG)
     other = dataclasses.replace(CONFIG, seed=1)
-    found = numbers(ready.get_ready(other, other), other)
+    found = numbers(ready.load_or_build_ready(other, other), other)
     assert not np.array_equal(found[1][0], expected[1][0])
 
 
@@ -174,21 +174,21 @@ def test_what_is_damaged_is_made_again(expected, folder, monkeypatch):
         monkeypatch.setattr(machine, "_LOADED", {})
         for path, content in whole.items():
             path.write_bytes(content)
-        assert ready.read_ready(ready.key_of(CONFIG)) is not None
+        assert ready.load_ready(ready.key_of(CONFIG)) is not None
         monkeypatch.setattr(machine, "_LOADED", {})
         (path,) = (path for path in whole if path.stem.partition("-")[2] == name)
         path.write_bytes(whole[path][:-1])
-        assert ready.read_ready(ready.key_of(CONFIG)) is None, name
-    again = numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
+        assert ready.load_ready(ready.key_of(CONFIG)) is None, name
+    again = numbers(ready.load_or_build_ready(CONFIG, CONFIG), CONFIG)
     jax.tree.map(np.testing.assert_array_equal, again, expected)
-    assert ready.read_ready(ready.key_of(CONFIG)) is not None
+    assert ready.load_ready(ready.key_of(CONFIG)) is not None
 
 
 @pytest.mark.slow
 def test_bad_input_is_refused_of_what_is_kept_too(expected):
     idle = dataclasses.replace(CONFIG, initial_std=2.0)
     with pytest.raises(ValueError, match=r"--initial-std 2\.0 would do nothing"):
-        ready.get_ready(idle, CONFIG)
+        ready.load_or_build_ready(idle, CONFIG)
 
 
 @pytest.mark.slow
@@ -196,9 +196,9 @@ def test_programs_need_no_code_of_others(folder, monkeypatch):
     """A process that plays other tasks has their code in memory too."""
     own = seam.targets
     monkeypatch.setattr(seam, "targets", lambda: [*own(), "mjx_reinforce_" + 64 * "0"])
-    prepared = ready.get_ready(CONFIG, CONFIG)
+    prepared = ready.load_or_build_ready(CONFIG, CONFIG)
     compile_run(prepared.programs(), CONFIG)
-    assert ready.read_ready(ready.key_of(CONFIG)) is not None
+    assert ready.load_ready(ready.key_of(CONFIG)) is not None
 
 
 def test_nothing_is_kept_of_code_of_the_users_or_where_kernels_are_looked_at(monkeypatch):
@@ -319,14 +319,15 @@ from mjx_reinforce import envs
 from mjx_reinforce.setup import ready
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.training.slots import compile_run
+from mjx_reinforce.training.slots import Slots, compile_slots
 configure_jax()
 if sys.argv[1] == "second":
     envs.make = None
 config = Config(env="InvertedPendulum-v5", num_seeds=2, num_episodes=2, eval_episodes=2)
-prepared = ready.get_ready(config, config)
-[(_, metrics, looked)] = compile_run(prepared.programs(), config).advance()
-print(prepared.engine, metrics["episode_return"].tolist(), looked["eval_return"])
+prepared = ready.load_or_build_ready(config, config)
+slots = Slots(compile_slots(prepared.programs(), config, 2), numpy.arange(2))
+[(_, metrics, eval_metrics)] = slots.advance()
+print(prepared.engine, metrics["episode_return"].tolist(), eval_metrics["eval_return"])
 print("mujoco" in sys.modules)
 """
 

@@ -112,8 +112,8 @@ class Machine:
         each = {name: np.stack([counts.from_int(x)] * 2) for name, x in made.items()}
         return SimpleNamespace(train_states=SimpleNamespace(**each))
 
-    def advance(self, look):
-        assert not look
+    def advance(self, evaluate):
+        assert not evaluate
         made = int(counts.to_int(np.asarray(self.budget.updates))) - self.updates
         self.env_steps += sum(itertools.islice(self.played, made))
         self.updates, self.now = self.updates + made, self.now + made

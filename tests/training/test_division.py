@@ -70,7 +70,7 @@ def test_what_is_divided(monkeypatch, seeds, episodes, here, backend, expected):
     config = Config(num_seeds=seeds, num_episodes=episodes)
     division = plan.divide_run(config)
     assert division == expected
-    assert division.lanes(seeds) >= seeds
+    assert division.capacity(seeds) >= seeds
     assert episodes % division.episodes == 0
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from mjx_reinforce.learning import counts
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training.driver import Driver, Runs
+from mjx_reinforce.training.driver import RunDriver, Runs
 from mjx_reinforce.training.record import Measured, RunRecord
 from mjx_reinforce.training.state import Best, first_best, keep_best
 
@@ -19,7 +19,7 @@ class Steps:
     """Slots whose state is a number of updates; policies return ``returns(number)``."""
 
     def __init__(self, returns=lambda updates: [updates, -updates], broken=False):
-        self.returns, self.broken, self.looks, self.number = returns, broken, [], 0
+        self.returns, self.broken, self.evaluated, self.number = returns, broken, [], 0
 
     def states(self):
         made = np.stack([np.asarray(counts.from_int(self.number))] * 2)
@@ -34,17 +34,17 @@ class Steps:
     def restore(self, rows):
         self.number = int(rows[0, 0])
 
-    def look(self):
+    def eval_metrics(self):
         names = ("eval_return", "eval_return_stochastic", "eval_length")
         zeros = {name: np.zeros(2, np.int32) for name in ("simulated_steps", "eval_steps")}
         return {name: np.asarray(self.returns(self.number), np.float32) for name in names} | zeros
 
     def evaluate(self):
-        return Measured(np.arange(2), {}, self.look())
+        return Measured(np.arange(2), {}, self.eval_metrics())
 
-    def advance(self, chosen, lengths, look, most):
-        self.looks.append(look)
-        looked = self.look() if look else {}
+    def advance(self, chosen, lengths, evaluate, max_blocks):
+        self.evaluated.append(evaluate)
+        eval_metrics = self.eval_metrics() if evaluate else {}
         ones = np.ones((BLOCK, 2), np.int32)
         metrics = dict.fromkeys(("env_steps", "episodes", "simulated_steps"), ones)
         metrics |= {
@@ -54,7 +54,7 @@ class Steps:
             "skipped_update": ones * self.broken,
         }
         self.number += BLOCK
-        return [Measured(np.arange(2), metrics, looked)]
+        return [Measured(np.arange(2), metrics, eval_metrics)]
 
     def test(self, actor):
         return {"eval_return": actor["w"] * 10.0}
@@ -76,8 +76,8 @@ class Diary:
 
 def driver_of(steps, *observers, config=CONFIG, threshold=None):
     record = RunRecord(config, threshold)
-    record.add_test = lambda result: None
-    return Driver(config, steps, record, RUNS, observers)
+    record.count_steps = lambda eval_metrics: None
+    return RunDriver(config, steps, record, RUNS, observers)
 
 
 def never():
@@ -94,7 +94,7 @@ def test_the_first_and_the_last_policies_are_evaluated_alone_and_others_with_the
     steps, diary = Steps(), Diary()
     driver = driver_of(steps, diary)
     driver.drive(never)
-    assert steps.looks == [False, True, True]
+    assert steps.evaluated == [False, True, True]
     assert diary.notes == [
         *("evaluated 0", "updated 2", "evaluated 2", "updated 4", "evaluated 4", "updated 6"),
         "evaluated 6",
@@ -153,7 +153,7 @@ def test_a_restored_run_goes_on_where_it_was():
     assert second.updates() == 4
     assert second.seconds() >= 100.0
     second.drive(never)
-    assert rest.looks == [True]
+    assert rest.evaluated == [True]
     assert second.record.history()["eval_return"][:, 0].tolist() == [0, 2, 4, 6]
 
 
@@ -165,7 +165,7 @@ STATES = SimpleNamespace(
 )
 
 
-def looked(number, *returns):
+def best_of(number, *returns):
     actor = {"w": np.full((3, 2), float(number)), "b": np.full(3, float(number))}
     made = np.tile([0, number], (3, 1))
     return Best(actor=actor, eval_return=np.array(returns, np.float32), num_updates=made)
@@ -179,8 +179,8 @@ def test_before_the_first_evaluation_every_return_is_better():
 
 
 def test_each_seed_keeps_its_own_best_and_of_equals_the_later():
-    best = keep_best(first_best(STATES), looked(1, 5, 5, 5))
-    best = keep_best(best, looked(2, 4, 5, 6))
+    best = keep_best(first_best(STATES), best_of(1, 5, 5, 5))
+    best = keep_best(best, best_of(2, 4, 5, 6))
     assert best.eval_return.tolist() == [5, 5, 6]
     assert best.actor["w"].tolist() == [[1, 1], [2, 2], [2, 2]]
     assert best.actor["b"].tolist() == [1, 2, 2]
@@ -188,6 +188,6 @@ def test_each_seed_keeps_its_own_best_and_of_equals_the_later():
 
 
 def test_what_is_not_a_number_is_never_the_best():
-    best = keep_best(first_best(STATES), looked(1, np.nan, -np.inf, 0))
+    best = keep_best(first_best(STATES), best_of(1, np.nan, -np.inf, 0))
     assert best.eval_return.tolist() == [-np.inf, -np.inf, 0]
     assert best.actor["w"][:, 0].tolist() == [0, 1, 1]

@@ -13,7 +13,7 @@ import mjx_reinforce as mr
 from mjx_reinforce.engine.base import Trajectory
 from mjx_reinforce.learning import counts, normalize, schedules, value
 from mjx_reinforce.learning.updates import Clock
-from mjx_reinforce.training.driver import Driver
+from mjx_reinforce.training.driver import RunDriver
 
 SMALL = ["--env", "Survive-v0", "--num-seeds", "1", "--num-episodes", "4", "--eval-episodes", "2"]
 SMALL += ["--hidden-sizes", "2", "--horizon", "8", "--engine", "vmap", "--eval-every", "1"]
@@ -46,7 +46,7 @@ def test_a_step_counts_over_the_end_of_an_int32():
 @pytest.mark.slow
 def test_a_run_passes_2_to_31_and_goes_on_there(run, tmp_path, monkeypatch):
     """Its files, its budget and its checkpoints count on, with schedules of 10^12 steps."""
-    begun, begin = 2**31 - 12, Driver.__init__
+    begun, begin = 2**31 - 12, RunDriver.__init__
 
     def late(self, *given):
         begin(self, *given)
@@ -57,7 +57,7 @@ def test_a_run_passes_2_to_31_and_goes_on_there(run, tmp_path, monkeypatch):
         self.states = self._before = self.slots.states()
         self.record.env_steps += begun
 
-    monkeypatch.setattr(Driver, "__init__", late)
+    monkeypatch.setattr(RunDriver, "__init__", late)
     budgets = ["--env-steps", "1e12", "--decay-steps", "9e11", "--final-std", "0.1"]
     budgets += ["--checkpoint-every", "1", "--output", "out"]
     assert run(*SMALL, *budgets, "--max-updates", 3) == 0

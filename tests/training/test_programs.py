@@ -40,8 +40,10 @@ class Counter:
 def advance(monkeypatch):
     """Runs a block of 4 updates of runs that play so many env steps an update, of a budget."""
 
-    def run(each, budget, look=False, visit=None, begun=0):
-        monkeypatch.setattr(programs, "measure", lambda played, evaluation: {"seen": evaluation})
+    def run(each, budget, evaluate=False, make_evaluation=None, begun=0):
+        monkeypatch.setattr(
+            programs, "evaluation_metrics", lambda played, evaluation: {"seen": evaluation}
+        )
         monkeypatch.setattr(programs, "step_with", Counter.step_with)
         num = len(each)
         none = jnp.stack([jnp.asarray(counts.from_int(begun))] * num)
@@ -50,8 +52,8 @@ def advance(monkeypatch):
             eval_keys=jax.random.split(jax.random.key(0), num),
             settings={"each": jnp.array(each)},
         )
-        made = jax.jit(programs.block_of_updates(Counter, 4, visit))
-        after, result = made(states, budget, jnp.asarray(look))
+        made = jax.jit(programs.block_of_updates(Counter, 4, make_evaluation))
+        after, result = made(states, budget, jnp.asarray(evaluate))
         return counts.to_int(after.train_states.num_updates).tolist(), result
 
     return run
@@ -67,12 +69,12 @@ def test_each_run_stops_after_the_update_that_reaches_its_budget(advance):
 
 def test_it_is_over_when_all_runs_are(advance):
     updates, result = advance([50, 60], Budget.of(100, None))
-    assert (updates, int(result.made)) == ([2, 2], 2)
+    assert (updates, int(result.num_updates)) == ([2, 2], 2)
     assert not result.metrics["env_steps"][2:].any()
     updates, result = advance([1, 1], Budget.of(None, 3))
-    assert (updates, int(result.made)) == ([3, 3], 3)
-    assert int(advance([1, 1], Budget.of(None, None))[1].made) == 4
-    assert int(advance([1], Budget.of(5, None), begun=5)[1].made) == 0
+    assert (updates, int(result.num_updates)) == ([3, 3], 3)
+    assert int(advance([1, 1], Budget.of(None, None))[1].num_updates) == 4
+    assert int(advance([1], Budget.of(5, None), begun=5)[1].num_updates) == 0
 
 
 def test_runs_count_beyond_32_bits(advance):
@@ -90,13 +92,17 @@ def test_schedules_are_told_the_share_of_the_budget(advance):
     np.testing.assert_allclose(result.metrics["share"][:, 0], [0, 0.125, 0.25, 0.375])
 
 
-def test_only_the_first_update_looks_and_only_where_asked(advance):
-    def visit(key, active):
+def test_only_the_first_update_evaluates_and_only_where_asked(advance):
+    def make_evaluation(key, active):
         del key
         return active.astype(jnp.int32) + 1
 
-    _, result = advance([1, 1], Budget.of(None, None), look=[True, False], visit=visit)
-    assert result.looked["seen"].tolist() == [2, 1]
-    _, result = advance([1, 1], Budget.of(None, None), look=False, visit=visit)
-    assert result.looked["seen"].tolist() == [1, 1]
-    assert advance([1], Budget.of(None, None), look=True)[1].looked == {}
+    _, result = advance(
+        [1, 1], Budget.of(None, None), evaluate=[True, False], make_evaluation=make_evaluation
+    )
+    assert result.eval_metrics["seen"].tolist() == [2, 1]
+    _, result = advance(
+        [1, 1], Budget.of(None, None), evaluate=False, make_evaluation=make_evaluation
+    )
+    assert result.eval_metrics["seen"].tolist() == [1, 1]
+    assert advance([1], Budget.of(None, None), evaluate=True)[1].eval_metrics == {}

@@ -44,7 +44,7 @@ def evaluation(*returns):
     }
 
 
-def looked(*returns):
+def evaluation_of(*returns):
     return Measured(np.arange(len(returns)), {}, evaluation(*returns))
 
 
@@ -55,10 +55,10 @@ def made(metrics):
 def filled():
     """A record of three seeds, two blocks and three evaluations."""
     record, random = RunRecord(Config(num_seeds=3, max_updates=100), 2.0), np.random.default_rng(0)
-    record.add_evaluation(looked(1, 2, 3), 0.1)
+    record.add_evaluation(evaluation_of(1, 2, 3), 0.1)
     for i in range(2):
         record.add_updates(made(block(random, 4, 3)))
-        record.add_evaluation(looked(i, np.nan, -3.5), 1.0 + i / 3)
+        record.add_evaluation(evaluation_of(i, np.nan, -3.5), 1.0 + i / 3)
     return record
 
 
@@ -85,7 +85,7 @@ def test_a_record_is_restored_exactly(tmp_path):
         both = []
         for x in (record, copy):
             x.add_updates(made(block(np.random.default_rng(i), 5, 3)))
-            both.append(x.add_evaluation(looked(5, 6, i), 3.0))
+            both.append(x.add_evaluation(evaluation_of(5, 6, i), 3.0))
         assert repr(both[0]) == repr(both[1])
 
 
@@ -106,7 +106,7 @@ METRICS = {  # two updates of two seeds; the second seed stands still in the sec
 def test_a_record_of_two_seeds_by_hand():
     config = Config(num_seeds=2, num_episodes=2, env_steps=60)
     record = RunRecord(config, threshold=8.0)
-    first = record.add_evaluation(looked(1, 9), 0.5)
+    first = record.add_evaluation(evaluation_of(1, 9), 0.5)
     assert "train_return" not in first
     assert record.is_evaluated()
     assert not record.finished()
@@ -114,7 +114,7 @@ def test_a_record_of_two_seeds_by_hand():
     met = record.add_updates(made(METRICS))
     assert not record.is_evaluated()
     assert met.tolist() == [1, 0]
-    second = record.add_evaluation(looked(7, 10), 2.00009)
+    second = record.add_evaluation(evaluation_of(7, 10), 2.00009)
     keys = ("seed", "update", "episodes", "env_steps", "wall_seconds", "train_return")
     rows = measured.lines({key: second[key] for key in keys}).decode().split()
     assert [row.rstrip(",") for row in rows] == ["0,2,4,70,2.0,nan", "1,1,2,40,2.0,4.0"]
@@ -139,7 +139,7 @@ def test_a_test_counts_among_what_was_simulated():
     counts = {name: int(record.arrays()[name]) for name in ("simulated", "evaluated")}
     assert counts["evaluated"] == 3 * 3 * 6
     tested = {"simulated_steps": np.array([5, 9, 7]), "eval_steps": np.array([4, 3, 2])}
-    record.add_test({name: x.astype(np.int32) for name, x in tested.items()})
+    record.count_steps({name: x.astype(np.int32) for name, x in tested.items()})
     useful = record.env_steps.sum() + counts["evaluated"] + 4 + 3 + 2
     fraction = useful / (counts["simulated"] + 5 + 9 + 7)
     assert record.summary("vmap", 1.0, 2.0)["useful_step_fraction"] == pytest.approx(fraction)

@@ -38,8 +38,8 @@ def test_what_is_measured_is_in_the_order_of_the_runs():
     lanes = pack_slots(np.ones(7, bool), np.zeros(7), 4, 2)
     assert lanes.tolist() == [[0, 2, 1, 3], [4, 6, 5, -1]]
     slots = [({"steps": np.stack([each, -each])}, {"return": each}) for each in lanes]
-    runs, metrics, looked = _of_slots(lanes, slots)
-    assert runs.tolist() == looked["return"].tolist() == list(range(7))
+    runs, metrics, eval_metrics = _of_slots(lanes, slots)
+    assert runs.tolist() == eval_metrics["return"].tolist() == list(range(7))
     assert metrics["steps"].tolist() == [[*range(7)], [*range(0, -7, -1)]]
 
 

@@ -24,7 +24,7 @@ from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import PRESETS
 from mjx_reinforce.setup.build import build, policy_settings
 from mjx_reinforce.training.programs import programs_of
-from mjx_reinforce.training.slots import compile_run
+from mjx_reinforce.training.slots import Slots, compile_slots
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,12 +101,14 @@ def train(case: Case, config: Config, *, stale: bool = False) -> np.ndarray:
     learner, horizon = build(env, config, policy)
     if stale:
         learner = stale_starts(lambda env: build(env, config, policy)[0], env)
-    traced = programs_of(env, lambda _: learner, horizon, config, config.num_seeds)
-    slots, scores = compile_run(traced, config), []
+    programs = programs_of(env, lambda _: learner, horizon, config, config.num_seeds)
+    compiled = compile_slots(programs, config, config.num_seeds)
+    slots = Slots(compiled, config.first_seed + np.arange(config.num_seeds))
+    scores = []
     for _ in range(-(-config.max_updates // config.eval_every)):
-        [measured] = slots.advance(look=False)
+        [measured] = slots.advance(evaluate=False)
         if case.score == "eval_return":
-            scores.append(slots.evaluate().looked[case.score][None])
+            scores.append(slots.evaluate().eval_metrics[case.score][None])
         else:
             scores.append(measured.metrics[case.score])
     return np.concatenate(scores)[: config.max_updates]
