@@ -23,13 +23,19 @@ def why_not(env: Any) -> str | None:
         return f"a thread plays a model of fewer than {_LEAST_DOFS} degrees of freedom faster"
     from mjx_reinforce.engine.team import tables  # imports MuJoCo
 
-    return tables.why(model) or (None if nvrtc.library() else nvrtc.version())
+    if reason := tables.why(model):
+        return reason
+    # Without the library its version is what to install.
+    if not nvrtc.library():
+        return nvrtc.version()
+    return None
 
 
 def played_by(env: Any) -> str:
     """Returns what plays an episode of an environment on a GPU, for people."""
-    why = why_not(env)
-    return f"a thread an episode ({why})" if why else f"{_lanes(env)} lanes an episode"
+    if reason := why_not(env):
+        return f"a thread an episode ({reason})"
+    return f"{_lanes(env)} lanes an episode"
 
 
 def physics_of(env: Any) -> Physics:
@@ -37,9 +43,13 @@ def physics_of(env: Any) -> Physics:
     from mjx_reinforce.engine.team import tables
 
     env = innermost(env)
-    model, shared = env.mj_model, _shared_memory()
-    text, far = tables.physics_text(model), tables.far_words(model)
-    return Physics(text, far, env.frame_skip, _lanes(env), shared)
+    return Physics(
+        text=tables.physics_text(env.mj_model),
+        far=tables.far_words(env.mj_model),
+        skip=env.frame_skip,
+        lanes=_lanes(env),
+        shared=_shared_memory(),
+    )
 
 
 def _lanes(env: Any) -> int:
@@ -56,6 +66,7 @@ def innermost(env: Any) -> Any:
 
 def _shared_memory() -> int:
     """Returns how many bytes of shared memory a block may have."""
-    cuda, found = ctypes.CDLL("libcuda.so.1"), ctypes.c_int()
-    cuda.cuDeviceGetAttribute(ctypes.byref(found), _SHARED_OF_BLOCK, 0)
-    return found.value
+    driver = ctypes.CDLL("libcuda.so.1")
+    num_bytes = ctypes.c_int()
+    driver.cuDeviceGetAttribute(ctypes.byref(num_bytes), _SHARED_OF_BLOCK, 0)
+    return num_bytes.value

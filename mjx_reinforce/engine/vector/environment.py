@@ -31,7 +31,7 @@ from mjx_reinforce.engine.contract import check_environment, check_shape
 from mjx_reinforce.engine.memory import gigabytes, host_memory
 from mjx_reinforce.engine.play.available import GENERATOR
 from mjx_reinforce.engine.play.choice import MapEngine, map_function
-from mjx_reinforce.engine.play.counter import key_of
+from mjx_reinforce.engine.play.counter import key_of_words
 
 #: When an environment whose episode has ended begins the next (Gymnasium's ``AutoresetMode``).
 AUTORESETS = ("next_step", "same_step", "disabled")
@@ -115,7 +115,7 @@ def advance_function(env: Environment, limit: int | None, autoreset: str) -> Cal
 
 def _begin(env: Environment, keys: jax.Array) -> VectorState:
     """Returns an environment at the start of its next episode, of keys as of ``VectorState``."""
-    key, reset_key = jax.random.split(key_of(keys))
+    key, reset_key = jax.random.split(key_of_words(keys))
     start = env.reset(reset_key)
     none, zero = jnp.zeros((), bool), jnp.zeros_like(start.reward)
     return VectorState(
