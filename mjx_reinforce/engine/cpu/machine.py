@@ -198,7 +198,8 @@ def _compile(text: str, machine: Machine) -> bytes:
 
 def _compile_elsewhere(text: str, machine: Machine) -> bytes:
     """Returns object code of a text; this process compiles where no other can."""
-    data = emit.elsewhere(text, machine.triple, machine.cpu, machine.features, effort=_effort(text))
+    effort = _effort(text)
+    data = emit.elsewhere(text, machine.triple, machine.cpu, machine.features, effort)
     return data or _compile(text, machine)
 
 

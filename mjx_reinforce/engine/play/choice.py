@@ -177,8 +177,7 @@ def map_function(
       ValueError: the name is unknown, or the engine does not support the function.
     """
     in_machine_code = functools.partial(machine_code, env, function, *examples)
-    engine_name, reason, call = pick(name, in_machine_code, jax.vmap(function))
-    return MapEngine(engine_name, reason, call)
+    return MapEngine(*pick(name, in_machine_code, jax.vmap(function)))
 
 
 def machine_code(

@@ -198,11 +198,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             )
         # None in the list draws a seed of that environment at random.
         random_seeds = np.random.SeedSequence().generate_state(self.num_envs)
-        seeds = [
-            int(random_seed if chosen is None else chosen)
-            for chosen, random_seed in zip(seed, random_seeds, strict=True)
-        ]
-        return _keys_of(seeds)
+        pairs = zip(seed, random_seeds, strict=True)
+        return _keys_of([int(drawn if chosen is None else chosen) for chosen, drawn in pairs])
 
     def _reset_masked(self, seed: Seeds, mask: np.ndarray) -> VectorState:
         """Returns the environments with new episodes where a mask [N] says so, of seeds if any."""
