@@ -254,15 +254,15 @@ def _by_teams(
     """Returns what ``load`` does, for teams of lanes; None if they do not play this."""
     if team.why_not(env) is not None:
         return None
-
+    model = team.physics_model(env)
     with base.keeping_whole():
         try:
             traced, shapes = scalarized.trace(function, *examples)
             # A kernel has the tables of one model. A function that simulates none, or another one,
             # is played by a thread an episode, which computes the physics as it was traced.
-            if {*scalar.owners(traced)} != {hex(id(team.innermost(env)))}:
+            if model is None or {*scalar.simulated_models(traced)} != {model.digest}:
                 return None
-            physics = team.physics_of(env)
+            physics = team.team_physics(model)
             source = f"{jaxprs.fingerprint(traced)} {physics} {objects.source_digest(*_WRITERS)}"
 
             def write() -> str:

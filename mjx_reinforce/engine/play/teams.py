@@ -3,6 +3,7 @@
 import ctypes
 from typing import Any
 
+from mjx_reinforce.engine.base import PhysicsModel
 from mjx_reinforce.engine.gpu import nvrtc
 from mjx_reinforce.engine.gpu.team_kernel import Physics
 
@@ -16,52 +17,52 @@ _SHARED_OF_BLOCK = 97
 
 def why_not(env: Any) -> str | None:
     """Returns in one line why teams do not play an environment; None if they do."""
-    model = getattr(innermost(env), "mj_model", None)
+    model = physics_model(env)
     if model is None:
         return "it simulates no model of MuJoCo's"
-    if model.nv < _LEAST_DOFS:
+    if model.mj_model.nv < _LEAST_DOFS:
         return f"a thread plays a model of fewer than {_LEAST_DOFS} degrees of freedom faster"
     from mjx_reinforce.engine.team import tables  # imports MuJoCo
 
-    if reason := tables.why(model):
+    if reason := tables.why(model.mj_model):
         return reason
     # Without the library its version is what to install.
-    if not nvrtc.library():
-        return nvrtc.version()
-    return None
+    return None if nvrtc.library() else nvrtc.version()
 
 
 def played_by(env: Any) -> str:
     """Returns what plays an episode of an environment on a GPU, for people."""
-    if reason := why_not(env):
+    model = physics_model(env)
+    reason = why_not(env)
+    if model is None or reason:
         return f"a thread an episode ({reason})"
-    return f"{_lanes(env)} lanes an episode"
+    return f"{_lanes(model)} lanes an episode"
 
 
-def physics_of(env: Any) -> Physics:
-    """Returns the physics of an environment that teams play."""
+def physics_model(env: Any) -> PhysicsModel | None:
+    """Returns what an environment simulates, within wrappers too; None if it does not offer it."""
+    while hasattr(env, "env"):
+        env = env.env
+    offer = getattr(env, "physics_model", None)
+    return None if offer is None else offer()
+
+
+def team_physics(model: PhysicsModel) -> Physics:
+    """Returns the physics of a model that teams play."""
     from mjx_reinforce.engine.team import tables
 
-    env = innermost(env)
     return Physics(
-        text=tables.physics_text(env.mj_model),
-        far=tables.far_words(env.mj_model),
-        skip=env.frame_skip,
-        lanes=_lanes(env),
+        text=tables.physics_text(model.mj_model),
+        far=tables.far_words(model.mj_model),
+        skip=model.frame_skip,
+        lanes=_lanes(model),
         shared=_shared_memory(),
     )
 
 
-def _lanes(env: Any) -> int:
+def _lanes(model: PhysicsModel) -> int:
     """Returns how many lanes play an episode."""
-    return 32 if innermost(env).mj_model.nv >= _WIDE else 16
-
-
-def innermost(env: Any) -> Any:
-    """Returns the environment that wrappers are around."""
-    while hasattr(env, "env"):
-        env = env.env
-    return env
+    return 32 if model.mj_model.nv >= _WIDE else 16
 
 
 def _shared_memory() -> int:
