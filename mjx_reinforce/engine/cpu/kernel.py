@@ -270,13 +270,13 @@ class _Work(handler.JobText):
         fields = self.places.inputs
         emit = LLVM(text, lambda number: Input(self.inputs[number], fields[number].dtype))
         values = emit.compile(step.schedule, step.outputs)
-        # Records are of the step before which the lanes' counters still are.
+        # Now, while the lanes' numbers of steps are still those of this step.
         self._record(values[:NUM_RECORDS], step.out_avals, alive)
         (goes_on,), (broken,), *carried = values[NUM_RECORDS:]
         # The state and the keys lie behind the actor, in the order in which a step returns them. A
         # lane without an episode carries on, too: nothing reads it before another one begins.
-        first = self.num_actor
-        for leaf, pointer, field in zip(carried, self.inputs[first:], fields[first:], strict=False):
+        pointers = self.inputs[self.num_actor :]
+        for leaf, pointer, field in zip(carried, pointers, fields[self.num_actor :], strict=False):
             for k, value in enumerate(leaf):
                 text.store(value, text.at(pointer, field.dtype, k), field.dtype)
         kind = text.type(_INT)
@@ -306,9 +306,9 @@ class _Work(handler.JobText):
         row = text.let(f"mul {kind} {row}, {episodes}")
         row = text.let(f"add {kind} {row}, {episode}")
         for values, result, aval in zip(records, self.records, avals, strict=False):
-            first = text.let(f"mul {kind} {row}, {text.constant(np.int64(len(values)))}")
+            start = text.let(f"mul {kind} {row}, {text.constant(np.int64(len(values)))}")
             for k, value in enumerate(values):
-                index = text.let(f"add {kind} {first}, {text.constant(np.int64(k))}")
+                index = text.let(f"add {kind} {start}, {text.constant(np.int64(k))}")
                 text.scatter(value, result, index, alive, aval.dtype)
 
     def _finish(self, ended: str) -> None:
@@ -390,11 +390,11 @@ class _Map(handler.JobText):
         text.line(f"br label %{head}")
         text.start(head)
         # A thread takes a vector's lanes of examples at once; others may have taken all.
-        first = text.let(f"atomicrmw add ptr {next_item}, i64 {text.lanes} monotonic")
-        unfinished = text.let(f"icmp ult i64 {first}, {total}")
+        first_item = text.let(f"atomicrmw add ptr {next_item}, i64 {text.lanes} monotonic")
+        unfinished = text.let(f"icmp ult i64 {first_item}, {total}")
         text.line(f"br i1 {unfinished}, label %{body}, label %{end}")
         text.start(body)
-        item, mask = self._items(first, total)
+        item, mask = self._items(first_item, total)
         # An example's numbers are a row, a lane's are a column: they are turned on the way in.
         for aval, buffer, column in zip(
             arguments, argument_buffers, columns_of_arguments, strict=True
@@ -414,14 +414,14 @@ class _Map(handler.JobText):
         text.leave()
         return text.function("void @work(ptr %job)")
 
-    def _items(self, first: str, total: str) -> tuple[str, str]:
+    def _items(self, first_item: str, total: str) -> tuple[str, str]:
         """Returns the example of each lane, and which lanes have one of their own."""
         text = self.text
         kind = text.type(_LONG)
         lanes = ", ".join(f"i64 {lane}" for lane in range(text.lanes))
         # A single lane is a scalar in LLVM, not a vector of one.
         offsets = "0" if text.lanes == 1 else f"<{lanes}>"
-        item = text.let(f"add {kind} {text.broadcast('i64', first)}, {offsets}")
+        item = text.let(f"add {kind} {text.broadcast('i64', first_item)}, {offsets}")
         count = text.broadcast("i64", total)
         mask = text.let(f"icmp ult {kind} {item}, {count}")
         last = text.let(f"sub {kind} {count}, {text.constant(np.int64(1))}")
@@ -432,5 +432,5 @@ class _Map(handler.JobText):
         """Returns where in an array [N, size] each lane's entries are."""
         text = self.text
         kind = text.type(_LONG)
-        first = text.let(f"mul {kind} {item}, {text.constant(np.int64(size))}")
-        return [text.let(f"add {kind} {first}, {text.constant(np.int64(k))}") for k in range(size)]
+        start = text.let(f"mul {kind} {item}, {text.constant(np.int64(size))}")
+        return [text.let(f"add {kind} {start}, {text.constant(np.int64(k))}") for k in range(size)]
