@@ -13,7 +13,13 @@ from brax.envs.base import Env, State
 from flax import struct
 from mujoco import mjMAXVAL, mjx  # pyright: ignore[reportAttributeAccessIssue] (a C extension)
 
-from mjx_reinforce.engine.base import Box, MjModel, is_kept_whole, observation_size
+from mjx_reinforce.engine.base import (
+    Box,
+    MjModel,
+    PhysicsModel,
+    is_kept_whole,
+    observation_size,
+)
 from mjx_reinforce.engine.checks import changed_fields, check_count, check_number
 from mjx_reinforce.engine.contract import check_shape
 from mjx_reinforce.engine.physics import mjx_internals, sensors
@@ -287,6 +293,16 @@ class MujocoEnv(Env):
             metrics=state.metrics | jax.tree.map(lambda x: jnp.asarray(x, dtype), terms),
         )
 
+    def physics_model(self) -> PhysicsModel:
+        """Returns what an env step simulates, for engines that compute the physics themselves."""
+        digest = f"{self._model_digest} {self.frame_skip}"
+        return PhysicsModel(self.mj_model, self.frame_skip, digest)
+
+    @functools.cached_property
+    def _model_digest(self) -> str:
+        """The model's hash, computed once: with large meshes that takes long, each trace asks."""
+        return models.digest(self.mj_model)
+
     def _stays_whole(self, episode: dict[str, jax.Array]) -> bool:
         """Returns whether the physics is to stay one operation, which device code computes."""
         return is_kept_whole() and not models.replaced(self.mj_model, episode)
@@ -302,8 +318,8 @@ class MujocoEnv(Env):
         results = {jax.tree_util.keystr(path): leaf for path, leaf in paths}
         sound = jax.ShapeDtypeStruct((), bool)
         operands = [getattr(start, field) for field in ("ctrl", *models.CARRIED)]
-        # The owner: by its address the engine knows whose model the operation is to simulate.
-        outputs = whole(name, results | {"sound": sound}, *operands, owner=hex(id(self)))
+        digest = self.physics_model().digest
+        outputs = whole(name, results | {"sound": sound}, *operands, model=digest)
         # In the order of ``results``, which is that of the tree's leaves; "sound" is the last.
         *leaves, is_sound = outputs.values()
         return tree.unflatten(leaves), is_sound

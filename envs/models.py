@@ -1,6 +1,7 @@
 """From MJCF to a model that MJX runs, or a clear error."""
 
 import copy
+import hashlib
 import importlib.resources
 import warnings
 from collections.abc import Callable
@@ -124,6 +125,14 @@ def _compile_model(
         return compiler(source)
     except Exception as error:  # mujoco.FatalError is no ValueError
         raise ValueError(f"MuJoCo cannot compile {_name(xml_file)}: {explain(error)}") from error
+
+
+def digest(model: MjModel) -> str:
+    """Returns a hash of all that is in a model, the same in every process."""
+    # As MuJoCo writes it to a file of its binary format, MJB: every field of mjModel.
+    data = np.empty(_C.mj_sizeModel(model), np.uint8)
+    _C.mj_saveModel(model, None, data)
+    return hashlib.sha256(data.tobytes()).hexdigest()
 
 
 def replaced(model: Any, episode: dict[str, Any]) -> dict[str, Any]:

@@ -181,7 +181,8 @@ def by_machine_code(model: Any, start: Start, steps: int) -> list[np.ndarray]:
     def play(constants: jax.Array) -> jax.Array:
         lengths: Any = {"num_episodes": 1, "horizon": steps + 1, "deterministic": True}
         key = jax.random.key(0)
-        return native.rollout(env, act, constants, distribution, key, **lengths).observation[1:, 0]
+        episodes = native.native_rollout(env, act, constants, distribution, key, **lengths)
+        return episodes.observation[1:, 0]
 
     shown = np.asarray(play(jnp.asarray(distribution.constants, jnp.result_type(float))))
     sizes = [1, *(x.size for x in fields(models.make_data(model)))]

@@ -195,6 +195,23 @@ def null_action(env: Environment) -> np.ndarray:
     return np.zeros(env.action_size, np.float32)
 
 
+class PhysicsModel(NamedTuple):
+    """What an env step simulates, for an engine that computes the physics by itself.
+
+    An environment may offer it by a method ``physics_model``. Within ``keeping_whole`` its physics
+    is then one operation, ``scalar.whole``, which carries the digest: so an engine knows which
+    model it is to compute, whatever else is traced with it.
+
+    mj_model: the model
+    frame_skip: physics steps an env step, all under the same control
+    digest: the name of both, the same in every process
+    """
+
+    mj_model: MjModel
+    frame_skip: int
+    digest: str
+
+
 #: JAX keeps what it traced with one value of this apart from what it traced with another.
 _WHOLE = jax.make_user_context(False)
 

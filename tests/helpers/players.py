@@ -52,8 +52,8 @@ def played(play, env, player, num_seeds=3, num_episodes=5, **options):
     return jax.tree.map(np.asarray, all_seeds(keys, actor))
 
 
-def both(env, player, other=rollouts.rollout, **options):
-    got = played(native.rollout, env, player, **options)
+def both(env, player, other=rollouts.vmap_rollout, **options):
+    got = played(native.native_rollout, env, player, **options)
     return got, played(other, env, player, **options)
 
 

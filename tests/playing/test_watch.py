@@ -14,7 +14,7 @@ from saved_runs import change_env, make_run
 from toys import Survive
 
 from mjx_reinforce import act, envs, load, load_policy, watch
-from mjx_reinforce.engine.play.rollouts import rollout
+from mjx_reinforce.engine.play.rollouts import vmap_rollout
 from mjx_reinforce.export import films
 
 
@@ -73,7 +73,7 @@ def test_the_film_is_the_episode(tmp_path):
     said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     policy, actor = load_policy(tmp_path / "policy", 1)  # the best by summary.json
 
-    played = rollout(
+    played = vmap_rollout(
         env,
         functools.partial(act, policy),
         actor,

@@ -103,7 +103,7 @@ def play(env: Any, policy: Callable[..., jax.Array], episodes: int, steps: int, 
     @jax.jit
     def roll(constants: jax.Array, key: jax.Array) -> Any:
         size: Any = {"num_episodes": episodes, "horizon": steps, "deterministic": True}
-        return native.rollout(env, act, constants, distribution, key, **size)
+        return native.native_rollout(env, act, constants, distribution, key, **size)
 
     constants = jnp.asarray(distribution.constants, jnp.result_type(float))
     return jax.tree.map(np.asarray, roll(constants, jax.random.key(seed)))

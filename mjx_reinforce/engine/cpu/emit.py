@@ -12,15 +12,17 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any, TypeVar
 
-Made = TypeVar("Made")
+Result = TypeVar("Result")
 #: Those that compile now, and the threads that wait for them.
 _PROCESSES: list[subprocess.Popen[bytes]] = []
 _THREADS: list[threading.Thread] = []
-#: Held while a process starts; none does once this one ends.
-_STARTING, _ENDS = threading.Lock(), threading.Event()
+#: Held while a process starts.
+_STARTING = threading.Lock()
+#: Set when this process ends: from then on none starts.
+_ENDS = threading.Event()
 
 
-def compiler(triple: str, cpu: str, features: str, effort: int) -> Any:
+def target_machine(triple: str, cpu: str, features: str, effort: int) -> Any:
     """Returns LLVM's compiler for a machine; the effort is 0 to 3."""
     import llvmlite.binding as llvm
 
@@ -45,6 +47,7 @@ def elsewhere(text: str, triple: str, cpu: str, features: str, effort: int) -> b
     Raises:
       RuntimeError: the process was stopped, or this one ends.
     """
+    # With -P this file's folder is not the first in which Python looks for modules.
     command = [sys.executable, "-P", __file__, triple, cpu, features, str(effort)]
     pipe = subprocess.PIPE
     with _STARTING:
@@ -58,27 +61,30 @@ def elsewhere(text: str, triple: str, cpu: str, features: str, effort: int) -> b
         except OSError:  # such as no memory, or no Python there any more
             return None
         _PROCESSES.append(process)
+    # Outside of the lock, which is held for a moment: this waits for minutes.
     data, _ = process.communicate(text.encode())
     _PROCESSES.remove(process)
     if process.returncode < 0:
         raise RuntimeError(f"LLVM was stopped by signal {-process.returncode}")
-    return None if process.returncode else data
+    if process.returncode:
+        return None
+    return data
 
 
-def later(work: Callable[[], Made]) -> Future[Made]:
+def later(work: Callable[[], Result]) -> Future[Result]:
     """Returns what ``work`` will return, in a thread of its own."""
-    made: Future[Made] = Future()
+    future: Future[Result] = Future()
 
     def do() -> None:
         try:
-            made.set_result(work())
+            future.set_result(work())
         except BaseException as error:  # whatever it is, who waits gets it
-            made.set_exception(error)
+            future.set_exception(error)
 
     thread = threading.Thread(target=do, daemon=True)
     _THREADS.append(thread)
     thread.start()
-    return made
+    return future
 
 
 @atexit.register
@@ -88,16 +94,17 @@ def end_processes() -> None:
         _ENDS.set()
         for process in _PROCESSES:
             process.kill()
+    # Their processes are gone, so they return at once; none is left in LLVM while Python ends.
     for thread in _THREADS:
         thread.join()
 
 
 def main() -> None:
-    """Compiles standard input to standard output; the arguments are those of ``compiler``."""
+    """Compiles standard input to standard output; arguments are those of ``target_machine``."""
     triple, cpu, features, effort = sys.argv[1:]
-    target = compiler(triple, cpu, features, int(effort))
-    made = target.emit_object(parse(sys.stdin.buffer.read().decode(), target))
-    sys.stdout.buffer.write(made)
+    target = target_machine(triple, cpu, features, int(effort))
+    module = parse(sys.stdin.buffer.read().decode(), target)
+    sys.stdout.buffer.write(target.emit_object(module))
 
 
 if __name__ == "__main__":

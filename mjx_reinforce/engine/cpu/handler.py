@@ -35,7 +35,8 @@ FIELDS = (
 _POINTERS = ("data", "bytes")
 #: The arguments and results that mean something here.
 LIMITS, THREADS, KEYS = range(3)
-REWARD, SIMULATED = 2, 5
+REWARD = 2
+SIMULATED = 5
 
 
 class Positions(NamedTuple):
@@ -95,8 +96,10 @@ def handler_text(
       zeroed: whether results are zero when ``@work`` begins.
     """
     num_results = len(result_bytes)
-    data_bytes, sizes_bytes = 8 * (num_args + num_results), 8 * num_results
+    # A job is one piece of memory: its fields, the buffers' addresses, the results' sizes.
     job_bytes = 8 * len(FIELDS)
+    data_bytes = 8 * (num_args + num_results)
+    sizes_bytes = 8 * num_results
     values: dict[str, Any] = {field: f"i32 0, i32 {number}" for number, field in enumerate(FIELDS)}
     values |= {
         "job": ", ".join("ptr" if field in _POINTERS else "i64" for field in FIELDS),
@@ -142,11 +145,11 @@ class JobText:
 
     def element(self, pointers: str, number: int) -> str:
         """Returns one of several pointers, such as those to the job's data."""
-        place = self.text.let(f"getelementptr inbounds ptr, ptr {pointers}, i64 {number}")
-        return self.text.let(f"load ptr, ptr {place}")
+        address = self.text.let(f"getelementptr inbounds ptr, ptr {pointers}, i64 {number}")
+        return self.text.let(f"load ptr, ptr {address}")
 
 
-#: The architectures of which it is known.
+#: The architectures of which it is known how.
 _FLUSHES = ("x86_64", "aarch64")
 
 
@@ -156,6 +159,8 @@ def flush(triple: str) -> str:
     XLA's own threads do so too. All threads of a job do the same, so that an episode is the same on
     any of them. ``@unflush`` undoes it, with what ``@flush`` returned.
     """
+    # macOS calls this architecture arm64 in its triples, LLVM and Linux aarch64.
     architecture = triple.partition("-")[0].replace("arm64", "aarch64")
-    known = architecture if architecture in _FLUSHES else "unknown"
-    return Path(__file__).with_name(f"flush_{known}.ll").read_text("utf-8")
+    if architecture not in _FLUSHES:
+        architecture = "unknown"
+    return Path(__file__).with_name(f"flush_{architecture}.ll").read_text("utf-8")

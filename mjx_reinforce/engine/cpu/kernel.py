@@ -36,12 +36,11 @@ _MOST_ON_STACK = 2**20
 
 #: The buffers of a call: so many arguments of its own, those of the actor and the state, the
 #: results, of which so many are records of steps.
-NUM_CONTROLS, NUM_RECORDS = 3, 3
-
-
-_LENGTH, _BROKEN = 3, 4
-
-
+NUM_CONTROLS = 3
+NUM_RECORDS = 3
+#: The results behind the records that ``@finish`` writes.
+_LENGTH = 3
+_BROKEN = 4
 #: What the queue looks at of a lane.
 _OF_LANES = ("alive", "seed", "episode", "step", "limit", "broken", "counted")
 _QUEUE = Path(__file__).with_name("queue.ll")
@@ -110,25 +109,48 @@ def layout(leaves: list[Any], num_actor: int, lanes: int) -> VectorLayout:
     end = 0
 
     def field(dtype: DTypeLike, entries: int) -> Field:
+        """Returns the next field; it begins at a multiple of the size of its vectors."""
         nonlocal end
-        vector = np.dtype(dtype).itemsize * lanes
-        begin = -(-end // vector) * vector
-        end = begin + entries * vector
-        return Field(begin, np.dtype(dtype), entries)
+        vector_bytes = np.dtype(dtype).itemsize * lanes
+        offset = -(-end // vector_bytes) * vector_bytes
+        end = offset + entries * vector_bytes
+        return Field(offset, np.dtype(dtype), entries)
 
     inputs = [field(x.dtype, int(np.prod(x.shape, dtype=int))) for x in leaves]
-    others = [field(x, 1) for x in (np.int32, np.int32, np.int64, np.int64, np.int64)]
     *state, keys, step, deterministic, alive = inputs[num_actor:]
-    actor, state = ([x for x in part if x.entries] for part in (inputs[:num_actor], state))
-    key = keys._replace(entries=2)
-    return VectorLayout(inputs, actor, state, key, step, deterministic, alive, *others, size=end)
+    return VectorLayout(
+        inputs=inputs,
+        actor=[x for x in inputs[:num_actor] if x.entries],
+        state=[x for x in state if x.entries],
+        # The queue writes the episode's key; that of a chunk is split from it in its first step.
+        key=keys._replace(entries=2),
+        step=step,
+        deterministic=deterministic,
+        alive=alive,
+        broken=field(np.int32, 1),
+        limit=field(np.int32, 1),
+        seed=field(np.int64, 1),
+        episode=field(np.int64, 1),
+        counted=field(np.int64, 1),
+        # Last, for each field above has moved the end.
+        size=end,
+    )
 
 
 def queue_text(places: VectorLayout, lanes: int) -> str:
     """Returns ``@begin``, ``@finish`` and ``@settle`` for lanes whose values are at ``places``."""
-    actor, state = places.actor, places.state
-    first_state = NUM_CONTROLS + len(actor)
-    first_result = first_state + len(state)
+    # Buffers are numbered: the controls, the actor, the state, the results.
+    first_state = NUM_CONTROLS + len(places.actor)
+    first_result = first_state + len(places.state)
+    copies_of_actor = [
+        # All episodes of a seed have the same actor.
+        _copy(f"actor{i}", field, NUM_CONTROLS + i, "%index")
+        for i, field in enumerate(places.actor)
+    ]
+    copies_of_state = [
+        _copy(f"state{i}", field, first_state + i, "%item") for i, field in enumerate(places.state)
+    ]
+    copies_of_state.append(_copy("keys", places.key, handler.KEYS, "%item"))
     values = {name: f"i32 0, i32 {number}" for number, name in enumerate(handler.FIELDS)}
     values |= {
         "lanes": str(lanes),
@@ -139,15 +161,8 @@ def queue_text(places: VectorLayout, lanes: int) -> str:
         "length_data": str(first_result + _LENGTH),
         "broken_data": str(first_result + _BROKEN),
         "simulated_data": str(first_result + handler.SIMULATED),
-        "copy_actor": "\n".join(
-            _copy(f"actor{i}", field, NUM_CONTROLS + i, "%index") for i, field in enumerate(actor)
-        ),
-        "copy_state": "\n".join(
-            [
-                *(_copy(f"state{i}", x, first_state + i, "%item") for i, x in enumerate(state)),
-                _copy("keys", places.key, handler.KEYS, "%item"),
-            ]
-        ),
+        "copy_actor": "\n".join(copies_of_actor),
+        "copy_state": "\n".join(copies_of_state),
     }
     return Template(_QUEUE.read_text("utf-8")).substitute(values)
 
@@ -165,6 +180,7 @@ def _lane(name: str, field: Field) -> str:
 
 def _copy(name: str, field: Field, buffer: int, row: str) -> str:
     """Returns the instructions that copy a row of a buffer into a lane's column of a field."""
+    # A lane's entries lie ``lanes`` numbers apart, its column: ``@copy4`` and ``@copy8`` stride.
     size = field.dtype.itemsize
     lines = [
         f"%{name}.buffer.at = getelementptr inbounds ptr, ptr %data, i64 {buffer}",
@@ -177,7 +193,8 @@ def _copy(name: str, field: Field, buffer: int, row: str) -> str:
     return "\n".join(f"  {line}" for line in lines)
 
 
-_INT, _LONG = np.dtype(np.int32), np.dtype(np.int64)
+_INT = np.dtype(np.int32)
+_LONG = np.dtype(np.int64)
 
 
 def kernel_text(step: scalarized.Scalarized, num_actor: int, lanes: int) -> str:
@@ -189,49 +206,59 @@ def kernel_text(step: scalarized.Scalarized, num_actor: int, lanes: int) -> str:
       lanes: how many lanes a vector has.
     """
     places = layout(step.in_avals, num_actor, lanes)
-    return queue_text(places, lanes) + _Work(Text(lanes, _MOST_ON_STACK), places, num_actor).write(
-        step
-    )
+    work = _Work(Text(lanes, _MOST_ON_STACK), places, num_actor)
+    return queue_text(places, lanes) + work.write(step)
 
 
 class _Work(handler.JobText):
     """Writes ``@work``; pointers are to the lane vectors of its memory."""
 
     def __init__(self, text: Text, places: VectorLayout, num_actor: int):
+        """Writes what a thread does once: it takes memory for its lanes, and finds all in it."""
         super().__init__(text)
-        self.places, self.num_actor = places, num_actor
+        self.places = places
+        self.num_actor = num_actor
         self.room, self.memory = self._allocate()
         self.inputs = [self._pointer(field) for field in places.inputs]
-        self.seed, self.episode = self._pointer(places.seed), self._pointer(places.episode)
-        self.step, self.broken = self._pointer(places.step), self._pointer(places.broken)
-        self.limit, self.alive = self._pointer(places.limit), self._pointer(places.alive)
-        self.horizon, self.episodes = self.job("horizon", "i64"), self.job("episodes", "i64")
-        first = NUM_CONTROLS + len(places.actor) + len(places.state)
+        self.seed = self._pointer(places.seed)
+        self.episode = self._pointer(places.episode)
+        self.step = self._pointer(places.step)
+        self.broken = self._pointer(places.broken)
+        self.limit = self._pointer(places.limit)
+        self.alive = self._pointer(places.alive)
+        self.horizon = self.job("horizon", "i64")
+        self.episodes = self.job("episodes", "i64")
+        first_result = NUM_CONTROLS + len(places.actor) + len(places.state)
         data = self.job("data", "ptr")
-        self.records = [self.element(data, first + k) for k in range(NUM_RECORDS)]
+        self.records = [self.element(data, first_result + k) for k in range(NUM_RECORDS)]
 
     def write(self, step: scalarized.Scalarized) -> str:
         """Returns the function that plays with a step."""
-        text, memory = self.text, self.memory
+        text = self.text
         text.line("%control = call i64 @flush()")
         text.store(text.constant(np.int64(-1)), self.seed, _LONG)  # a lane's first seed is new
         for lane in range(text.lanes):
-            text.line(f"call void @begin(ptr %job, ptr {memory}, i64 {lane})")
-        before, head, body, end = text.block, text.label(), text.label(), text.label()
+            text.line(f"call void @begin(ptr %job, ptr {self.memory}, i64 {lane})")
+        entry = text.block
+        head = text.label()
+        body = text.label()
+        end = text.label()
         text.line(f"br label %{head}")
         text.start(head)
+        # The body may end in another block than it begins in, which is known behind it: the phi
+        # that counts iterations is filled in then.
         iterations = text.hole()
         alive = self._is_set(text.load(self.alive, _INT))
         text.line(f"br i1 {text.any(alive)}, label %{body}, label %{end}")
         text.start(body)
         self._finish(self._play(step, alive))
-        more = text.let(f"add i64 {iterations.name}, 1")
-        text.fill(iterations, f"phi i64 [0, %{before}], [{more}, %{text.block}]")
+        next_iterations = text.let(f"add i64 {iterations.name}, 1")
+        text.fill(iterations, f"phi i64 [0, %{entry}], [{next_iterations}, %{text.block}]")
         text.line(f"br label %{head}")
         text.start(end)
         for lane in range(text.lanes):
-            lane_of = f"ptr %job, ptr {memory}, i64 {lane}"
-            text.line(f"call void @settle({lane_of}, i64 {iterations.name})")
+            lane_of_job = f"ptr %job, ptr {self.memory}, i64 {lane}"
+            text.line(f"call void @settle({lane_of_job}, i64 {iterations.name})")
         text.line("call void @unflush(i64 %control)")
         text.line(f"call void @free(ptr {self.room})")
         text.leave()
@@ -239,45 +266,55 @@ class _Work(handler.JobText):
 
     def _play(self, step: scalarized.Scalarized, alive: str) -> str:
         """Writes a step of all lanes; returns which of them have ended their episode by it."""
-        text, fields = self.text, self.places.inputs
+        text = self.text
+        fields = self.places.inputs
         emit = LLVM(text, lambda number: Input(self.inputs[number], fields[number].dtype))
         values = emit.compile(step.schedule, step.outputs)
+        # Now, while the lanes' numbers of steps are still those of this step.
         self._record(values[:NUM_RECORDS], step.out_avals, alive)
         (goes_on,), (broken,), *carried = values[NUM_RECORDS:]
-        first = self.num_actor
-        for leaf, to, field in zip(carried, self.inputs[first:], fields[first:], strict=False):
+        # The state and the keys lie behind the actor, in the order in which a step returns them. A
+        # lane without an episode carries on, too: nothing reads it before another one begins.
+        pointers = self.inputs[self.num_actor :]
+        for leaf, pointer, field in zip(carried, pointers, fields[self.num_actor :], strict=False):
             for k, value in enumerate(leaf):
-                text.store(value, text.at(to, field.dtype, k), field.dtype)
+                text.store(value, text.at(pointer, field.dtype, k), field.dtype)
         kind = text.type(_INT)
-        one = text.constant(np.int32(1))
-        steps = text.let(f"add {kind} {text.load(self.step, _INT)}, {one}")
+        increment = text.constant(np.int32(1))
+        steps = text.let(f"add {kind} {text.load(self.step, _INT)}, {increment}")
         text.store(steps, self.step, _INT)
         text.store(broken, self.broken, _INT)
         late = text.let(f"icmp sge {kind} {steps}, {text.load(self.limit, _INT)}")
-        bools, true = text.type(bool), text.constant(np.True_)
+        bools = text.type(bool)
+        true = text.constant(np.True_)
         stops = text.let(f"xor {bools} {self._is_set(goes_on)}, {true}")
         stops = text.let(f"or {bools} {stops}, {late}")
         return text.let(f"and {bools} {stops}, {alive}")
 
     def _record(self, records: list[Any], avals: list[Any], alive: str) -> None:
         """Writes observation, action and reward into results [S, T, N, ...]."""
-        text, kind = self.text, self.text.type(_LONG)
-        seed, episode = text.load(self.seed, _LONG), text.load(self.episode, _LONG)
+        text = self.text
+        kind = text.type(_LONG)
+        seed = text.load(self.seed, _LONG)
+        episode = text.load(self.episode, _LONG)
         step = text.let(f"sext {text.type(_INT)} {text.load(self.step, _INT)} to {kind}")
-        horizon, episodes = (text.broadcast("i64", x) for x in (self.horizon, self.episodes))
+        horizon = text.broadcast("i64", self.horizon)
+        episodes = text.broadcast("i64", self.episodes)
+        # In 64 bits: the numbers of a sweep's records may be more than 2^31.
         row = text.let(f"mul {kind} {seed}, {horizon}")
         row = text.let(f"add {kind} {row}, {step}")
         row = text.let(f"mul {kind} {row}, {episodes}")
         row = text.let(f"add {kind} {row}, {episode}")
         for values, result, aval in zip(records, self.records, avals, strict=False):
-            first = text.let(f"mul {kind} {row}, {text.constant(np.int64(len(values)))}")
+            start = text.let(f"mul {kind} {row}, {text.constant(np.int64(len(values)))}")
             for k, value in enumerate(values):
-                index = text.let(f"add {kind} {first}, {text.constant(np.int64(k))}")
+                index = text.let(f"add {kind} {start}, {text.constant(np.int64(k))}")
                 text.scatter(value, result, index, alive, aval.dtype)
 
     def _finish(self, ended: str) -> None:
         """Writes what is done for the lanes whose episode has ended."""
         text = self.text
+        # Most steps end no episode: one test of all lanes skips a test of each.
         with text.when(text.any(ended)):
             mask = text.mask(ended)
             for lane in range(text.lanes):
@@ -286,7 +323,9 @@ class _Work(handler.JobText):
 
     def _allocate(self) -> tuple[str, str]:
         """Returns what is to be freed, and the aligned memory in it, all zero."""
-        text, size = self.text, self.places.size
+        text = self.text
+        size = self.places.size
+        # On the heap: of a large model it is more than XLA's threads have on their stacks.
         room = text.let(f"call ptr @malloc(i64 {size + ALIGNMENT})")
         number = text.let(f"ptrtoint ptr {room} to i64")
         number = text.let(f"add i64 {number}, {ALIGNMENT - 1}")
@@ -325,52 +364,64 @@ class _Map(handler.JobText):
 
     def __init__(self, text: Text, written: scalarized.Scalarized):
         super().__init__(text)
-        self.written, self.inputs = written, written.in_avals
+        self.written = written
+        self.inputs = written.in_avals
 
     def write(self) -> str:
         """Returns the function."""
-        text, lanes = self.text, self.text.lanes
+        text = self.text
         text.line("%control = call i64 @flush()")
-        total, data = self.job("total", "i64"), self.job("data", "ptr")
-        next_at = self.field("next")
-        given = [x for x in self.inputs if num_entries(x)]
-        made = [x for x in self.written.out_avals if num_entries(x)]
-        buffers = [self.element(data, k) for k in range(1 + len(given) + len(made))]
-        arguments, results = buffers[1 : 1 + len(given)], buffers[1 + len(given) :]
+        total = self.job("total", "i64")
+        data = self.job("data", "ptr")
+        next_item = self.field("next")
+        # Leaves without numbers have no buffer; the first one has the number of threads.
+        arguments = [x for x in self.inputs if num_entries(x)]
+        results = [x for x in self.written.out_avals if num_entries(x)]
+        buffers = [self.element(data, k) for k in range(1 + len(arguments) + len(results))]
+        argument_buffers = buffers[1 : 1 + len(arguments)]
+        result_buffers = buffers[1 + len(arguments) :]
         columns = [
             text.reserve(x.dtype, num_entries(x)) if num_entries(x) else "null" for x in self.inputs
         ]
-        head, body, end = text.label(), text.label(), text.label()
+        columns_of_arguments = [column for column in columns if column != "null"]
+        head = text.label()
+        body = text.label()
+        end = text.label()
         text.line(f"br label %{head}")
         text.start(head)
-        first = text.let(f"atomicrmw add ptr {next_at}, i64 {lanes} monotonic")
-        some = text.let(f"icmp ult i64 {first}, {total}")
-        text.line(f"br i1 {some}, label %{body}, label %{end}")
+        # A thread takes a vector's lanes of examples at once; others may have taken all.
+        first_item = text.let(f"atomicrmw add ptr {next_item}, i64 {text.lanes} monotonic")
+        unfinished = text.let(f"icmp ult i64 {first_item}, {total}")
+        text.line(f"br i1 {unfinished}, label %{body}, label %{end}")
         text.start(body)
-        item, mask = self._items(first, total)
-        for aval, source, column in zip(
-            given, arguments, (x for x in columns if x != "null"), strict=True
+        item, mask = self._items(first_item, total)
+        # An example's numbers are a row, a lane's are a column: they are turned on the way in.
+        for aval, buffer, column in zip(
+            arguments, argument_buffers, columns_of_arguments, strict=True
         ):
             for k, index in enumerate(self._indices(item, num_entries(aval))):
-                value = text.gather(source, index, aval.dtype)
+                value = text.gather(buffer, index, aval.dtype)
                 text.store(value, text.at(column, aval.dtype, k), aval.dtype)
         emit = LLVM(text, lambda k: Input(columns[k], np.dtype(self.inputs[k].dtype)))
         outputs = emit.compile(self.written.schedule, self.written.outputs)
-        for aval, target, values in zip(made, results, (x for x in outputs if x), strict=True):
+        filled_outputs = [values for values in outputs if values]
+        for aval, buffer, values in zip(results, result_buffers, filled_outputs, strict=True):
             for value, index in zip(values, self._indices(item, num_entries(aval)), strict=True):
-                text.scatter(value, target, index, mask, aval.dtype)
+                text.scatter(value, buffer, index, mask, aval.dtype)
         text.line(f"br label %{head}")
         text.start(end)
         text.line("call void @unflush(i64 %control)")
         text.leave()
         return text.function("void @work(ptr %job)")
 
-    def _items(self, first: str, total: str) -> tuple[str, str]:
+    def _items(self, first_item: str, total: str) -> tuple[str, str]:
         """Returns the example of each lane, and which lanes have one of their own."""
-        text, kind = self.text, self.text.type(_LONG)
+        text = self.text
+        kind = text.type(_LONG)
         lanes = ", ".join(f"i64 {lane}" for lane in range(text.lanes))
+        # A single lane is a scalar in LLVM, not a vector of one.
         offsets = "0" if text.lanes == 1 else f"<{lanes}>"
-        item = text.let(f"add {kind} {text.broadcast('i64', first)}, {offsets}")
+        item = text.let(f"add {kind} {text.broadcast('i64', first_item)}, {offsets}")
         count = text.broadcast("i64", total)
         mask = text.let(f"icmp ult {kind} {item}, {count}")
         last = text.let(f"sub {kind} {count}, {text.constant(np.int64(1))}")
@@ -379,6 +430,7 @@ class _Map(handler.JobText):
 
     def _indices(self, item: str, size: int) -> list[str]:
         """Returns where in an array [N, size] each lane's entries are."""
-        text, kind = self.text, self.text.type(_LONG)
-        first = text.let(f"mul {kind} {item}, {text.constant(np.int64(size))}")
-        return [text.let(f"add {kind} {first}, {text.constant(np.int64(k))}") for k in range(size)]
+        text = self.text
+        kind = text.type(_LONG)
+        start = text.let(f"mul {kind} {item}, {text.constant(np.int64(size))}")
+        return [text.let(f"add {kind} {start}, {text.constant(np.int64(k))}") for k in range(size)]

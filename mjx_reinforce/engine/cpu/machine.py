@@ -59,18 +59,18 @@ class Code(NamedTuple):
     """Functions in memory. They stay until the process ends: other threads may still run them.
 
     key: a name for all that the code depends on
-    made: function -> where it is, once they are in memory
+    future_addresses: function -> where it is, once they are in memory
     compiled: whether it was compiled now, and not read from disk
     """
 
     key: str
-    made: Future[dict[str, int]]
+    future_addresses: Future[dict[str, int]]
     compiled: bool
 
     @property
     def addresses(self) -> dict[str, int]:
         """Returns where the functions are; waits until they are in memory."""
-        return self.made.result()
+        return self.future_addresses.result()
 
 
 def this_machine(level: str | None = None) -> Machine:
@@ -97,12 +97,14 @@ def this_machine(level: str | None = None) -> Machine:
         return Machine(triple, level, _WIDE if lanes == 16 else "", lanes)
     if features.get("avx512f"):
         return Machine(triple, llvm.get_host_cpu_name(), f"{features.flatten()},{_WIDE}", 16)
+    # Without AVX that of SSE, or of NEON: 128 bits.
     lanes = 8 if features.get("avx") else 4
     return Machine(triple, llvm.get_host_cpu_name(), features.flatten(), lanes)
 
 
 def _check_level(level: str, triple: str, features: dict[str, bool]) -> int:
     """Returns the lanes of a level; ValueError if this CPU is below it."""
+    # A level has the features of all levels before it, too.
     names = list(LEVELS)
     needed = [f for name in names[: names.index(level) + 1] for f in LEVELS[name][1]]
     lacking = [feature for feature in needed if not features.get(feature)]
@@ -141,11 +143,12 @@ def load_module(
     key = objects.key_of(*machine, *names, source)
     with _LOCK:
         if key not in _LOADED:
-            if found := objects.kept(key, folder):
-                made = _done(_link(key, names, found))
+            object_code = objects.kept(key, folder)
+            if object_code:
+                future = _done(_link(key, names, object_code))
             else:
-                made = _make(key, write(), names, machine, folder)
-            _LOADED[key] = Code(key, made, compiled=not found)
+                future = _make(key, write(), names, machine, folder)
+            _LOADED[key] = Code(key, future, compiled=not object_code)
         return _LOADED[key]
 
 
@@ -158,6 +161,7 @@ def _make(
         data = objects.make(key, folder, text, lambda text: compile(text, machine))
         return _link(key, names, data)
 
+    # A program without Python's own executable, as one that embeds it, has no other process.
     if len(text) <= _LONG_TEXT or not sys.executable:
         return _done(finish(_compile))
     emit.parse(text, _target(machine))  # what is no LLVM IR is known at once
@@ -165,9 +169,9 @@ def _make(
 
 
 def _done(addresses: dict[str, int]) -> Future[dict[str, int]]:
-    made: Future[dict[str, int]] = Future()
-    made.set_result(addresses)
-    return made
+    future: Future[dict[str, int]] = Future()
+    future.set_result(addresses)
+    return future
 
 
 def in_memory() -> list[str]:
@@ -194,8 +198,9 @@ def _compile(text: str, machine: Machine) -> bytes:
 
 def _compile_elsewhere(text: str, machine: Machine) -> bytes:
     """Returns object code of a text; this process compiles where no other can."""
-    of_machine = machine.triple, machine.cpu, machine.features
-    return emit.elsewhere(text, *of_machine, _effort(text)) or _compile(text, machine)
+    effort = _effort(text)
+    data = emit.elsewhere(text, machine.triple, machine.cpu, machine.features, effort)
+    return data or _compile(text, machine)
 
 
 def _effort(text: str) -> int:
@@ -209,7 +214,7 @@ def _effort(text: str) -> int:
 
 def _target(machine: Machine, effort: int = 2) -> Any:
     """Returns LLVM's compiler for a machine."""
-    return emit.compiler(machine.triple, machine.cpu, machine.features, effort)
+    return emit.target_machine(machine.triple, machine.cpu, machine.features, effort)
 
 
 def _link(key: str, names: tuple[str, ...], data: bytes) -> dict[str, int]:
@@ -221,6 +226,7 @@ def _link(key: str, names: tuple[str, ...], data: bytes) -> dict[str, int]:
         builder.export_symbol(name)
     library = builder.link(_linker(), f"{key}.{next(_NUMBERS)}")
     addresses = {name: library[name] for name in names}
+    # Its code would be unloaded with the Python object, while threads of XLA may still run it.
     library.detach()
     return addresses
 

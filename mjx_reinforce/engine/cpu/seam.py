@@ -17,8 +17,8 @@ from mjx_reinforce.engine.cpu import emit, handler, machine
 from mjx_reinforce.engine.cpu.machine import Code
 
 _WAITING = Path(__file__).with_name("waiting.ll")
-#: The keys of the code that XLA knows.
-_KNOWN: set[str] = set()
+#: The keys of the code whose handler XLA has.
+_REGISTERED: set[str] = set()
 
 
 def call(
@@ -41,12 +41,16 @@ def register(code: Code) -> None:
     Raises:
       RuntimeError: XLA does not take it.
     """
-    if code.key in _KNOWN:
+    if code.key in _REGISTERED:
         return
     jax.devices()  # a handler refused before XLA has started would keep it from starting
-    address = ctypes.c_void_p(code.addresses["handler"] if code.made.done() else _waiting(code))
-    jax.ffi.register_ffi_target(_target(code.key), jax.ffi.pycapsule(address), platform="cpu")
-    _KNOWN.add(code.key)
+    # XLA keeps the first address that it gets; of code that is still compiled that of a handler
+    # which waits for it.
+    compiled = code.future_addresses.done()
+    address = code.addresses["handler"] if compiled else _waiting_handler(code)
+    capsule = jax.ffi.pycapsule(ctypes.c_void_p(address))
+    jax.ffi.register_ffi_target(_target(code.key), capsule, platform="cpu")
+    _REGISTERED.add(code.key)
 
 
 def targets() -> list[str]:
@@ -74,19 +78,24 @@ def _target(key: str) -> str:
     return f"mjx_reinforce_{key}"
 
 
-def _waiting(code: Code) -> int:
+def _waiting_handler(code: Code) -> int:
     """Returns a handler that waits for that of code which is still compiled, and calls it.
 
     XLA compiles the program around it meanwhile.
     """
     text = f"; waits for {code.key}\n{handler.with_entry(_WAITING, {})}"
-    names, target = ("handler", "slot", "failed"), machine.this_machine()
-    found = machine.load_module(text, lambda: text, names, target, None).addresses
+    names = ("handler", "slot", "failed")
+    target = machine.this_machine()
+    # A short text is compiled at once, so these addresses need no waiting.
+    addresses = machine.load_module(text, lambda: text, names, target, None).addresses
 
-    def fill(made: Future[dict[str, int]]) -> None:
-        ready = found["failed"] if made.exception() else made.result()["handler"]
-        ctypes.c_void_p.from_address(found["slot"]).value = ready
+    def fill_slot(future: Future[dict[str, int]]) -> None:
+        address = addresses["failed"] if future.exception() else future.result()["handler"]
+        # The waiting handler loads the slot atomically, and an aligned pointer is stored at once.
+        ctypes.c_void_p.from_address(addresses["slot"]).value = address
 
-    code.made.add_done_callback(fill)
-    atexit.register(emit.end_processes)  # before JAX ends, which waits for running programs
-    return found["handler"]
+    code.future_addresses.add_done_callback(fill_slot)
+    # At exit the last registered function is called first: so this is before JAX ends, which waits
+    # for running programs, and these for their code.
+    atexit.register(emit.end_processes)
+    return addresses["handler"]

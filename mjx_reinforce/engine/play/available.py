@@ -16,8 +16,12 @@ _OLDEST = (20,)
 GENERATOR = "threefry2x32"
 #: Settings of JAX that change numbers.
 _SETTINGS = (
-    *("jax_default_matmul_precision", "jax_default_prng_impl", "jax_threefry_partitionable"),
-    *("jax_random_seed_offset", "jax_disable_most_optimizations", "jax_numpy_dtype_promotion"),
+    "jax_default_matmul_precision",
+    "jax_default_prng_impl",
+    "jax_threefry_partitionable",
+    "jax_random_seed_offset",
+    "jax_disable_most_optimizations",
+    "jax_numpy_dtype_promotion",
 )
 
 
@@ -32,8 +36,8 @@ def made_for() -> str:
         return reason
     import llvmlite
 
-    made_for = gpu.kernel_dependencies() if platform() == "gpu" else machine.this_machine()
-    return f"{llvmlite.__version__} {made_for}"
+    target = gpu.kernel_dependencies() if platform() == "gpu" else machine.this_machine()
+    return f"{llvmlite.__version__} {target}"
 
 
 def known_by() -> dict[str, Any]:
@@ -47,7 +51,8 @@ def known_by() -> dict[str, Any]:
         code = made_for()
     else:
         code = f"llvmlite {made_for().partition(' ')[0]}, {_short(machine.this_machine())}"
-    cpu = _host_cpu() if platform() == "cpu" else None  # a GPU's numbers do not depend on it
+    # A GPU's numbers do not depend on the CPU beside it: such a run may move to another host.
+    cpu = _host_cpu() if platform() == "cpu" else None
     settings = {name: str(jax.config.values[name]) for name in _SETTINGS}
     return {"cpu": cpu, "machine_code": code, "jax_settings": settings}
 
@@ -60,10 +65,10 @@ def _host_cpu() -> str:
         return host.processor() or host.machine()
 
 
-def _short(made_for: machine.Machine) -> str:
+def _short(target: machine.Machine) -> str:
     """Returns a machine's name, with a hash of its many features."""
-    digest = hashlib.sha256(made_for.features.encode()).hexdigest()[:8]
-    return f"{made_for.cpu}, {made_for.lanes} lanes, features {digest}"
+    digest = hashlib.sha256(target.features.encode()).hexdigest()[:8]
+    return f"{target.cpu}, {target.lanes} lanes, features {digest}"
 
 
 def unavailable() -> str | None:
@@ -74,15 +79,20 @@ def unavailable() -> str | None:
         return "it was never tried on Windows"
     if sys.maxsize < 2**32 or sys.byteorder != "little":
         return "it needs a little-endian machine of 64 bits"
+    # A damaged or foreign build raises OSError when its library is loaded, not ImportError.
     try:
         import llvmlite.binding
     except (ImportError, OSError) as error:
         return f"llvmlite cannot be loaded: {error}; pip install 'llvmlite>=0.45'"
     if llvmlite.binding.llvm_version_info < _OLDEST:
         return f"llvmlite {llvmlite.__version__} is too old; pip install 'llvmlite>=0.45'"
+    # The kernels write Threefry out themselves, so no other generator has the noise that ``vmap``
+    # draws; nor has Threefry itself, where it is not partitionable.
     generator = jax.config.values["jax_default_prng_impl"]
     if generator != GENERATOR:
         return f"it draws noise as {GENERATOR} does, not as {generator}"
     if not jax.config.values["jax_threefry_partitionable"]:
         return "it draws noise as JAX does with jax_threefry_partitionable"
-    return gpu.kernels_unavailable() if platform() == "gpu" else None
+    if platform() == "gpu":
+        return gpu.kernels_unavailable()
+    return None

@@ -29,7 +29,7 @@ from mjx_reinforce.engine.play import teams as team
 _WRONG_JAX = "0.10.2"
 
 #: What an engine plays with: a rollout, or a function of many environments.
-Made = TypeVar("Made")
+Function = TypeVar("Function")
 Rollout: TypeAlias = Callable[..., Trajectory]
 
 
@@ -51,7 +51,7 @@ class Engine(NamedTuple):
 
     name: "vmap" or "native"
     why: the reason it was chosen, for people
-    rollout: as ``mjx_reinforce.engine.play.rollouts.rollout``
+    rollout: as ``mjx_reinforce.engine.play.rollouts.vmap_rollout``
     seconds: wall time that making it took, most of it for machine code
     """
 
@@ -82,24 +82,26 @@ def choose(
     Raises:
       ValueError: the name is unknown, or the engine does not support the environment.
     """
-    began = time.perf_counter()
+    start_time = time.perf_counter()
 
     def in_machine_code() -> Rollout | str:
         if policy is None or horizon is None:
             return "every episode has a policy of its own"
-        play = _from_any_key if name == "auto" else native.rollout
-        return native.unsupported(env, *policy, horizon) or play
+        # Of a key that machine code cannot draw from "auto" plays by ``vmap``; who asked for
+        # "native" gets an error.
+        native_rollout = _from_any_key if name == "auto" else native.native_rollout
+        return native.unsupported(env, *policy, horizon) or native_rollout
 
-    found, why, play = pick(name, in_machine_code, rollouts.rollout)
-    if (found, available.platform()) == ("native", "gpu"):
-        why += f", {team.played_by(env)}"
-    return Engine(found, why, play, time.perf_counter() - began)
+    engine_name, reason, rollout = pick(name, in_machine_code, rollouts.vmap_rollout)
+    if engine_name == "native" and available.platform() == "gpu":
+        reason += f", {team.played_by(env)}"
+    return Engine(engine_name, reason, rollout, time.perf_counter() - start_time)
 
 
 def pick(
-    name: str, in_machine_code: Callable[[], Made | str], by_vmap: Made
-) -> tuple[str, str, Made]:
-    """Returns an engine's name, the reason it was chosen, and what it made.
+    name: str, in_machine_code: Callable[[], Function | str], by_vmap: Function
+) -> tuple[str, str, Function]:
+    """Returns an engine's name, the reason it was chosen, and what it plays with.
 
     Args:
       name: one of ``ENGINES``.
@@ -110,15 +112,17 @@ def pick(
       ValueError: the name is unknown, or the engine cannot play this.
     """
     check_name("engine", name, dict.fromkeys(ENGINES))
-    why = "chosen by name"
+    reason = "chosen by name"
     if name != "vmap":
-        made = in_machine_code()
-        if not isinstance(made, str):
-            device = "CPU" if jax.default_backend() == "cpu" else "GPU"
-            return "native", f"machine code for this {device}" if name == "auto" else why, made
+        # It is compiled here, so that what LLVM refuses is a reason for ``vmap``, too.
+        function = in_machine_code()
+        if not isinstance(function, str):
+            if name == "auto":
+                reason = f"machine code for this {jax.default_backend().upper()}"
+            return "native", reason, function
         if name == "native":
-            raise ValueError(f"the native engine cannot play this: {made}; choose auto")
-        why = f"machine code cannot play this: {made}"
+            raise ValueError(f"the native engine cannot play this: {function}; choose auto")
+        reason = f"machine code cannot play this: {function}"
     if (jax.default_backend(), jax.__version__) == ("cpu", _WRONG_JAX):
         warnings.warn(
             f"JAX {_WRONG_JAX} computes some products of many rows wrongly on CPUs, and the engine "
@@ -126,20 +130,20 @@ def pick(
             "(docs/troubleshooting.md)",
             stacklevel=2,
         )
-    return "vmap", why, by_vmap
+    return "vmap", reason, by_vmap
 
 
-def _from_any_key(*given: Any, **options: Any) -> Trajectory:
+def _from_any_key(
+    env: Environment, act: Act, actor: PyTree, distribution: Acts, key: jax.Array, **options: Any
+) -> Trajectory:
     """Plays in machine code, or as ``vmap`` where that cannot draw the noise of the key.
 
-    Args:
-      *given: the environment, the policy, the actor, the distribution and the key.
-      **options: see ``rollouts.rollout``.
+    Arguments and options are those of ``rollouts.vmap_rollout``.
     """
-    against = native.against_key(given[4])
-    if against:
-        warnings.warn(f"machine code cannot play this: {against}; vmap plays it", stacklevel=2)
-    return (rollouts.rollout if against else native.rollout)(*given, **options)
+    if reason := native.against_key(key):
+        warnings.warn(f"machine code cannot play this: {reason}; vmap plays it", stacklevel=2)
+        return rollouts.vmap_rollout(env, act, actor, distribution, key, **options)
+    return native.native_rollout(env, act, actor, distribution, key, **options)
 
 
 class MapEngine(NamedTuple):
@@ -183,8 +187,8 @@ def machine_code(
 
     Arguments are those of ``map_function``.
     """
-    if against := available.unavailable():
-        return against
+    if reason := available.unavailable():
+        return reason
     name = f"{getattr(function, '__name__', 'a function')} of {program.name_of(env)}"
     try:
         return program.machine_map(function, *examples, env=env, name=name)
@@ -259,19 +263,31 @@ def rollout(
     check_policy(act, actor, distribution, base.shapes(env.reset, jax.random.key(0)).obs)
     policy = ActingPolicy(act, actor, distribution)
     play = _rollout_of(engine, env, policy, horizon)
-    options: dict[str, Any] = {"deterministic": deterministic, "active": active}
-    given = env, _of_any_batch(act), actor, distribution, key
-    return play(*given, num_episodes=num_episodes, horizon=horizon, **options)
+    # The engine was chosen by the policy of one observation, which machine code computes;
+    # ``vmap_rollout`` passes it those of all episodes.
+    return play(
+        env,
+        _of_any_batch(act),
+        actor,
+        distribution,
+        key,
+        num_episodes=num_episodes,
+        horizon=horizon,
+        deterministic=deterministic,
+        active=active,
+    )
 
 
 def _rollout_of(engine: str, env: Environment, policy: ActingPolicy, horizon: int) -> Rollout:
     """Returns the rollout of an engine."""
-    large = sum(np.size(x) for x in jax.tree.leaves(policy.actor)) > _MOST_PARAMETERS
-    if engine == "auto" and large and available.platform() == "cpu":
-        examples = base.shapes(env.reset, jax.random.key(0)), base.null_action(env)
-        step = machine_code(env, env.step, *examples)
+    num_parameters = sum(np.size(x) for x in jax.tree.leaves(policy.actor))
+    on_cpu = available.platform() == "cpu"
+    if engine == "auto" and num_parameters > _MOST_PARAMETERS and on_cpu:
+        start = base.shapes(env.reset, jax.random.key(0))
+        step = machine_code(env, env.step, start, base.null_action(env))
         if not isinstance(step, str):
-            return functools.partial(rollouts.rollout, env_step=_episodes_last(step))
+            return functools.partial(rollouts.vmap_rollout, env_step=_episodes_last(step))
+    # The parameters may be tracers here: an engine is chosen by their shapes.
     shapes = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, policy.actor))
     return choose(engine, env, policy._replace(actor=shapes), horizon).rollout
 
@@ -279,18 +295,19 @@ def _rollout_of(engine: str, env: Environment, policy: ActingPolicy, horizon: in
 def _of_any_batch(act: Act) -> Act:
     """Returns a policy of one observation [O] as one of [O] or [N, O]."""
 
-    def batched(params: PyTree, observation: jax.Array) -> jax.Array:
-        mapped = act if observation.ndim == 1 else jax.vmap(act, (None, 0))
-        return mapped(params, observation)
+    def act_on_any(params: PyTree, observation: jax.Array) -> jax.Array:
+        if observation.ndim == 1:
+            return act(params, observation)
+        return jax.vmap(act, (None, 0))(params, observation)
 
-    return batched
+    return act_on_any
 
 
 def _episodes_last(step: Callable[[Any, jax.Array], Any]) -> Callable[[Any, jax.Array], Any]:
     """Returns a step of N environments, the first axis of every array, with N as the last axis."""
 
-    def turned(state: PyTree, action: jax.Array) -> Any:
-        first = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), (state, action))
-        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), step(*first))
+    def step_last(state: PyTree, action: jax.Array) -> Any:
+        state, action = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), (state, action))
+        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), step(state, action))
 
-    return turned
+    return step_last

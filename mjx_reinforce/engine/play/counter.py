@@ -26,11 +26,14 @@ def hash_pair(key: jax.Array, count: jax.Array) -> tuple[jax.Array, jax.Array]:
       count: [...] uint32.
     """
     keys = (key[0], key[1], key[0] ^ key[1] ^ jnp.uint32(_PARITY))
-    x, y = jnp.broadcast_to(keys[0], count.shape), count + keys[1]
+    # The high word of the counter is 0, so nothing is added to the first word of the key.
+    x = jnp.broadcast_to(keys[0], count.shape)
+    y = count + keys[1]
     for group in range(5):
         for rotation in _ROTATIONS[group % 2]:
             x = x + y
             y = x ^ ((y << jnp.uint32(rotation)) | (y >> jnp.uint32(32 - rotation)))
+        # After four rounds a part of the key is injected, and the number of the injection.
         x = x + keys[(group + 1) % 3]
         y = y + keys[(group + 2) % 3] + jnp.uint32(group + 1)
     return x, y
@@ -52,7 +55,7 @@ def at_counter(key: jax.Array, count: jax.Array) -> jax.Array:
     return jax.random.wrap_key_data(jnp.append(key, count), impl=impl)
 
 
-def key_of(words: jax.Array) -> jax.Array:
+def key_of_words(words: jax.Array) -> jax.Array:
     """Returns a key that draws what JAX's draws, and can be split, within what is written out.
 
     Args:
@@ -71,7 +74,10 @@ def _bits(data: jax.Array, width: int, shape: tuple[int, ...]) -> jax.Array:
       shape: of the result.
     """
     count = jnp.arange(math.prod(shape), dtype=jnp.uint32)
-    x, y = hash_pair(data[:2], count + data[2] if data.size == 3 else count)
+    if data.size == 3:
+        count = count + data[2]
+    x, y = hash_pair(data[:2], count)
+    # JAX takes both words for a number of 64 bits, and of a shorter one the low bits of their xor.
     if width == 64:
         bits = (x.astype(jnp.uint64) << jnp.uint64(32)) | y.astype(jnp.uint64)
     else:
@@ -97,5 +103,12 @@ def _refuse(*_: object) -> jax.Array:
 @functools.cache
 def _generator(words: int, name: str, tag: str, split: Callable, fold_in: Callable) -> object:
     """Returns JAX's generator of keys of so many words, in operations that can be written out."""
-    made = {"key_shape": (words,), "name": name, "tag": tag, "split": split, "fold_in": fold_in}
-    return random.define_prng_impl(seed=_refuse, random_bits=_bits, **made)
+    return random.define_prng_impl(
+        key_shape=(words,),
+        seed=_refuse,
+        split=split,
+        random_bits=_bits,
+        fold_in=fold_in,
+        name=name,
+        tag=tag,
+    )

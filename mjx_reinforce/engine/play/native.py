@@ -1,8 +1,8 @@
 """Complete episodes in machine code: the whole rollout is one call.
 
-``rollout`` is ``rollouts.rollout`` for CPUs and NVIDIA GPUs. Start states are drawn by the same
-calls as everywhere, noise from the same keys, so the same key gives the same episodes, up to
-rounding.
+``native_rollout`` is ``rollouts.vmap_rollout`` for CPUs and NVIDIA GPUs. Start states are drawn by
+the same calls as everywhere, noise from the same keys, so the same key gives the same episodes, up
+to rounding.
 """
 
 import functools
@@ -20,7 +20,7 @@ from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.cpu import seam as cpu
 from mjx_reinforce.engine.gpu import seam as gpu
 from mjx_reinforce.engine.play import available
-from mjx_reinforce.engine.play.counter import key_of
+from mjx_reinforce.engine.play.counter import key_of_words
 from mjx_reinforce.engine.play.program import (
     NativeProgram,
     build_program,
@@ -34,7 +34,7 @@ from mjx_reinforce.engine.scalar import TooLarge, UnsupportedPrimitive
 _REMEDY = f'make keys with jax.random.key(seed, impl="{available.GENERATOR}"), or choose auto'
 
 
-def rollout(
+def native_rollout(
     env: Environment,
     act: Act,
     actor: PyTree,
@@ -48,7 +48,7 @@ def rollout(
     limit: int | jax.Array | None = None,
     threads: int = 0,
 ) -> Trajectory:
-    """Plays N episodes from fresh resets; arguments and result are those of ``rollouts.rollout``.
+    """Plays N episodes from fresh resets, as ``rollouts.vmap_rollout`` does.
 
     Vmapped over seeds it remains one call, in which no lane waits for another: an episode that is
     over makes room for the next, of whatever seed. One that is not played takes no lane.
@@ -58,29 +58,32 @@ def rollout(
     Raises:
       ValueError: machine code cannot play this; see ``unsupported``.
     """
-    steps = horizon if limit is None else limit
-    episode.check_each(num_episodes, deterministic=deterministic, active=active, limit=steps)
+    if limit is None:
+        limit = horizon
+    episode.check_each(num_episodes, deterministic=deterministic, active=active, limit=limit)
     check_shape("threads", threads, ())
-    if against := against_key(key):
-        raise ValueError(f"the native engine cannot play this: {against}; {_REMEDY}")
+    if reason := against_key(key):
+        raise ValueError(f"the native engine cannot play this: {reason}; {_REMEDY}")
     try:
         program = build_program(env, act, actor, distribution, episode.chunk_length(horizon))
     except (TooLarge, UnsupportedPrimitive) as error:
         raise ValueError(f"the native engine cannot play this: {error}") from error
     state, keys = _begin(env, program, episode.episode_keys(key, num_episodes))
-    limits = episode.signed_limits(active, deterministic, jnp.minimum(steps, horizon))
-    given = (
-        jnp.broadcast_to(limits, num_episodes),
-        jax.random.key_data(keys),
-        *(x.reshape(-1) for x in jax.tree.leaves(actor) if x.size),
-        *(stored(x).reshape(num_episodes, -1) for x in jax.tree.leaves(state) if x.size),
-    )
+    limits = episode.signed_limits(active, deterministic, jnp.minimum(limit, horizon))
+    limits = jnp.broadcast_to(limits, num_episodes)
+    words = jax.random.key_data(keys)
+    # Empty leaves have no buffer: the kernels count buffers, see ``kernel.queue_text``.
+    parameters = [x.reshape(-1) for x in jax.tree.leaves(actor) if x.size]
+    starts = [stored(x).reshape(num_episodes, -1) for x in jax.tree.leaves(state) if x.size]
     if isinstance(program.code, machine.Code):
-        results = _results(program, horizon, num_episodes)
-        played = cpu.call(program.code, results, given[0], jnp.int32(threads), *given[1:])
+        shapes = _result_shapes(program, horizon, num_episodes)
+        num_threads = jnp.int32(threads)
+        results = cpu.call(program.code, shapes, limits, num_threads, words, *parameters, *starts)
     else:
-        played = _episodes_before_numbers(gpu.launch(program.code, program.record, horizon, *given))
-    observation, action, reward, length, broken, simulated = played
+        results = _episodes_before_numbers(
+            gpu.launch(program.code, program.record, horizon, limits, words, *parameters, *starts)
+        )
+    observation, action, reward, length, broken, simulated = results
     return Trajectory(
         observation=observation,
         action=action.reshape(horizon, num_episodes, *program.record[1].shape),
@@ -93,20 +96,23 @@ def rollout(
 
 def _begin(env: Environment, program: NativeProgram, keys: jax.Array) -> tuple[Any, jax.Array]:
     """Returns the starts of episodes by their keys [N], and the keys [N] of their noise."""
+    begin_by_vmap = jax.vmap(functools.partial(episode.begin, env))
     if isinstance(program.code, machine.Code) or program.code.lanes == 1:
-        return jax.vmap(functools.partial(episode.begin, env))(keys)
+        return begin_by_vmap(keys)
 
+    # Teams of lanes start a large model, too: in XLA's reset its sums would be atomic on a GPU, and
+    # their bits would differ from run to run.
     def begin(words: jax.Array) -> tuple[Any, jax.Array]:
-        state, noise = episode.begin(env, key_of(words))
-        return state, jax.random.key_data(noise)
+        state, noise_key = episode.begin(env, key_of_words(words))
+        return state, jax.random.key_data(noise_key)
 
     words = jax.random.key_data(keys)
     try:
-        begins = machine_map(begin, words[0], env=env, name=f"the start of {name_of(env)}")
+        begin_all = machine_map(begin, words[0], env=env, name=f"the start of {name_of(env)}")
     except (TooLarge, UnsupportedPrimitive, TypeError):
-        return jax.vmap(functools.partial(episode.begin, env))(keys)
-    state, noise = begins(words)
-    return state, jax.random.wrap_key_data(noise)
+        return begin_by_vmap(keys)
+    state, noise_words = begin_all(words)
+    return state, jax.random.wrap_key_data(noise_words)
 
 
 def against_key(key: jax.Array) -> str | None:
@@ -119,6 +125,7 @@ def against_key(key: jax.Array) -> str | None:
 
 def _episodes_before_numbers(results: Sequence[jax.Array]) -> Sequence[jax.Array]:
     """Returns a kernel's results with the records' axes in the order that a CPU writes them in."""
+    # Threads of a warp write the same number of neighboring episodes at once: [T, numbers, N].
     observation, action, reward = (jnp.swapaxes(x, 1, 2) for x in results[:3])
     return observation, action, reward[..., 0], *results[3:]
 
@@ -136,7 +143,9 @@ def unsupported(
     return None
 
 
-def _results(program: NativeProgram, horizon: int, num_episodes: int) -> list[jax.ShapeDtypeStruct]:
+def _result_shapes(
+    program: NativeProgram, horizon: int, num_episodes: int
+) -> list[jax.ShapeDtypeStruct]:
     """Returns the shapes of what a call returns; see ``handler.handler_text``."""
     shape = jax.ShapeDtypeStruct
     observation, action, reward = program.record

@@ -71,28 +71,32 @@ def step_function(
       length: steps whose noise is drawn with one key, as ``episode.play_chunks`` does.
     """
     leaves, tree = jax.tree.flatten(base.shapes(env.reset, jax.random.key(0)))
-    drawn = jax.eval_shape(lambda: distribution.noise(jax.random.key(0), ()))
-    words = int(np.prod(drawn.shape, dtype=int))  # random ones that the noise of a step takes
+    step_noise = jax.eval_shape(lambda: distribution.noise(jax.random.key(0), ()))
+    words_per_step = int(np.prod(step_noise.shape, dtype=int))
 
     def step(actor, carried, t, deterministic, alive):
-        state = [
-            (x != 0) if leaf.dtype == bool else x
-            for x, leaf in zip(carried.state, leaves, strict=True)
-        ]
-        state, alive = tree.unflatten(state), alive != 0
-        at = t % length
-        keys = lax.cond(at == 0, lambda keys: split(keys[0]), lambda keys: keys, carried.keys)
-        offset = (at * words).astype(jnp.uint32)
+        """Plays one step of one episode, and draws no more noise than that takes."""
+        state = tree.unflatten(
+            restored(x, leaf.dtype) for x, leaf in zip(carried.state, leaves, strict=True)
+        )
+        alive = alive != 0
+        # ``episode.draw_noise`` splits the key where a chunk begins, and draws the noise of all its
+        # steps from the second half. That of this step begins so many words later.
+        chunk_step = t % length
+        keys = lax.cond(
+            chunk_step == 0, lambda keys: split(keys[0]), lambda keys: keys, carried.keys
+        )
+        offset = (chunk_step * words_per_step).astype(jnp.uint32)
         noise = distribution.noise(at_counter(keys[1], offset), ())
-        played = episode.step(
+        result = episode.step(
             env.step, act, distribution, actor, state, noise, alive, deterministic != 0
         )
-        after = jax.tree.leaves(episode.hold(alive, played.state, state))
+        next_state = jax.tree.leaves(episode.hold(alive, result.state, state))
         return StepResult(
-            record=[played.observation, played.action, played.reward],
-            alive=played.alive.astype(jnp.int32),
-            broken=played.broken.astype(jnp.int32),
-            carried=Carried([stored(x) for x in after], keys),
+            record=[result.observation, result.action, result.reward],
+            alive=result.alive.astype(jnp.int32),
+            broken=result.broken.astype(jnp.int32),
+            carried=Carried([stored(x) for x in next_state], keys),
         )
 
     return step
@@ -101,6 +105,11 @@ def step_function(
 def stored(x: jax.Array) -> jax.Array:
     """Returns a leaf of the state as it is kept between steps: bools as int32."""
     return x.astype(jnp.int32) if x.dtype == bool else x
+
+
+def restored(x: jax.Array, dtype: np.dtype) -> jax.Array:
+    """Returns a leaf of the state as the environment has it, of what ``stored`` made of it."""
+    return x != 0 if dtype == np.bool_ else x
 
 
 def step_shapes(env: Environment, actor: PyTree) -> tuple[Any, ...]:
@@ -141,11 +150,14 @@ def build_program(
     """
     examples = step_shapes(env, actor)
     function = step_function(env, act, distribution, length)
-    if available.platform() != "cpu":  # a thread without an episode does not play
-        function, examples = while_running(function), examples[:-1]
+    # A lane of a vector computes steps also where it has no episode; a thread of a GPU does not.
+    if available.platform() != "cpu":
+        function = while_running(function)
+        examples = examples[:-1]
     num_actor = len(jax.tree.leaves(actor))
 
     def write_cpu(written: scalarized.Scalarized, target: machine.Machine) -> str:
+        """Writes the step, the loop over episodes and the way from XLA to it, as LLVM IR."""
         buffers = [x for x in jax.tree.leaves((actor, examples[1].state)) if np.prod(x.shape)]
         sizes = [np.dtype(x.dtype).itemsize for x in written.out_avals[: kernel.NUM_RECORDS]]
         num_args = kernel.NUM_CONTROLS + len(buffers)
@@ -199,26 +211,37 @@ def load(
       TooLarge: writing it out and compiling it would take minutes.
       UnsupportedPrimitive: it has an operation that cannot be written.
     """
-    on_cpu = available.platform() == "cpu"
-    if not on_cpu and (found := _by_teams(use, env, function, examples, writers)):
-        return found
-    target = machine.this_machine() if on_cpu else None
-    unrolled = SCANS if target else _GPU_SCANS
+    target = machine.this_machine() if available.platform() == "cpu" else None
+    unrolled = SCANS
+    if target is None:
+        team_kernel_and_shapes = _by_teams(use, env, function, examples, writers)
+        if team_kernel_and_shapes is not None:
+            return team_kernel_and_shapes
+        unrolled = _GPU_SCANS
     traced, shapes = scalarized.trace(function, *examples, unrolled=unrolled)
     source = f"{use} {jaxprs.fingerprint(traced)} {objects.source_digest(*_WRITERS)}"
 
     def write() -> str:
-        written = _written(traced, shapes, 0 if env is None else observation_size(env))
+        """Writes it out; that takes seconds, and is done where there is no code of this source."""
+        entries = 0 if env is None else observation_size(env)
+        written = _write_out(traced, shapes, entries)
         title = f"; {name}, {sum(written.operations.values()):,} scalar operations\n"
-        return title + (writers.cpu(written, target) if target else writers.gpu(written))
+        if target is None:
+            return title + writers.gpu(written)
+        return title + writers.cpu(written, target)
 
-    if target:
-        return machine.load_module(source, write, handler.NAMES, target, objects.folder()), shapes
-    capability = gpu_seam.compute_capability()
-    return ptx.load_kernel(source, write, capability, objects.folder()), shapes
+    if target is None:
+        capability = gpu_seam.compute_capability()
+        return ptx.load_kernel(source, write, capability, objects.folder()), shapes
+    return machine.load_module(source, write, handler.NAMES, target, objects.folder()), shapes
 
 
-def _written(traced: jaxprs.Program, shapes: Any, entries: int = 0) -> scalarized.Scalarized:
+def _write_out(traced: jaxprs.Program, shapes: Any, entries: int = 0) -> scalarized.Scalarized:
+    """Returns a traced function written out; of an observation of many entries it is too large.
+
+    Raises:
+      UnsupportedPrimitive: it closes over an array that has no value yet.
+    """
     written = scalarized.build(traced, shapes, BRANCH_COST, SCANS, entries=entries)
     if written.captured:
         raise scalar.UnsupportedPrimitive("it needs an array of an outer transformation")
@@ -231,17 +254,19 @@ def _by_teams(
     """Returns what ``load`` does, for teams of lanes; None if they do not play this."""
     if team.why_not(env) is not None:
         return None
-
+    model = team.physics_model(env)
     with base.keeping_whole():
         try:
             traced, shapes = scalarized.trace(function, *examples)
-            if {*scalar.owners(traced)} != {hex(id(team.innermost(env)))}:
+            # A kernel has the tables of one model. A function that simulates none, or another one,
+            # is played by a thread an episode, which computes the physics as it was traced.
+            if model is None or {*scalar.simulated_models(traced)} != {model.digest}:
                 return None
-            physics = team.physics_of(env)
+            physics = team.team_physics(model)
             source = f"{jaxprs.fingerprint(traced)} {physics} {objects.source_digest(*_WRITERS)}"
 
             def write() -> str:
-                return writers.team(_written(traced, shapes), physics)
+                return writers.team(_write_out(traced, shapes), physics)
 
             capability = gpu_seam.compute_capability()
             return ptx.load_kernel(f"{use} {source}", write, capability, objects.folder()), shapes
@@ -274,42 +299,44 @@ def machine_map(
       TypeError: numbers of another size.
     """
     leaves, tree = jax.tree.flatten(examples)
-    given = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
+    arguments = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
 
     def flat(*values: jax.Array) -> list[Any]:
-        whole = [x != 0 if leaf.dtype == bool else x for x, leaf in zip(values, given, strict=True)]
-        return [stored(x) for x in jax.tree.leaves(function(*tree.unflatten(whole)))]
+        args = tree.unflatten(
+            restored(x, leaf.dtype) for x, leaf in zip(values, arguments, strict=True)
+        )
+        return [stored(x) for x in jax.tree.leaves(function(*args))]
 
-    out = base.shapes(function, *examples)
-    results, out_tree = jax.tree.flatten(out)
-    kept = [jax.eval_shape(stored, x) for x in given]
-    for leaf in (*kept, *map(jax.eval_shape, [stored] * len(results), results)):
+    results, out_tree = jax.tree.flatten(base.shapes(function, *examples))
+    stored_arguments = [jax.eval_shape(stored, x) for x in arguments]
+    stored_results = [jax.eval_shape(stored, x) for x in results]
+    for leaf in stored_arguments + stored_results:
         if np.dtype(leaf.dtype).itemsize not in (4, 8):
             raise TypeError(f"it has numbers of {leaf.dtype}, not of 32 or 64 bits")
     writers = Writers(_write_cpu, gpu_kernel.mapping_text, team_kernel.mapping_text)
-    code, _ = load("map", env, flat, kept, writers, name)
+    code, _ = load("map", env, flat, stored_arguments, writers, name)
 
-    def mapped(*args: PyTree) -> Any:
+    def map_rows(*args: PyTree) -> Any:
+        """Returns the function's results of arguments whose first axis is N, in every leaf."""
         values = jax.tree.leaves(args)
         num = values[0].shape[0]
+        # A leaf without numbers has no buffer: it is left out here, and zeros stand for it below.
         rows = [stored(x).reshape(num, -1) for x in values if x.size]
-        shapes = [
-            jax.ShapeDtypeStruct((num, x.size), jnp.int32 if x.dtype == bool else x.dtype)
-            for x in results
-            if x.size
-        ]
+        shapes = [jax.ShapeDtypeStruct((num, x.size), x.dtype) for x in stored_results if x.size]
         if isinstance(code, machine.Code):
-            made = iter(cpu_seam.call(code, shapes, jnp.int32(0), *rows))
+            # 0 threads stand for all that XLA has.
+            columns = iter(cpu_seam.call(code, shapes, jnp.int32(0), *rows))
         else:
-            made = iter(gpu_seam.launch_map(code, shapes, *rows))
-        return out_tree.unflatten(
-            next(made).reshape(num, *x.shape).astype(x.dtype)
-            if x.size
-            else jnp.zeros((num, *x.shape), x.dtype)
-            for x in results
-        )
+            columns = iter(gpu_seam.launch_map(code, shapes, *rows))
+        outputs = []
+        for x in results:
+            if x.size:
+                outputs.append(next(columns).reshape(num, *x.shape).astype(x.dtype))
+            else:
+                outputs.append(jnp.zeros((num, *x.shape), x.dtype))
+        return out_tree.unflatten(outputs)
 
-    return mapped
+    return map_rows
 
 
 def _write_cpu(written: scalarized.Scalarized, target: machine.Machine) -> str:
@@ -322,17 +349,21 @@ def _write_cpu(written: scalarized.Scalarized, target: machine.Machine) -> str:
 
 def name_of(env: Any) -> str:
     """Returns the class of an environment, and of those in it if it wraps one."""
+    name = type(env).__name__
     inner = getattr(env, "env", None)
-    return type(env).__name__ + ("" if inner is None else f" of {name_of(inner)}")
+    if inner is None:
+        return name
+    return f"{name} of {name_of(inner)}"
 
 
 def refusal(error: Exception) -> str:
     """Returns in one line why machine code cannot be made, from what was raised."""
-    said = " ".join(str(error).split())
+    message = " ".join(str(error).split())
     if isinstance(error, (TypeError, scalar.TooLarge, scalar.UnsupportedPrimitive)):
-        return said
+        return message
+    # llvmlite raises RuntimeError itself, JAX subclasses of it.
     if type(error) is RuntimeError:
-        return f"LLVM refuses its program: {said}"
+        return f"LLVM refuses its program: {message}"
     return f"it cannot be written out ({explain(error)})"
 
 

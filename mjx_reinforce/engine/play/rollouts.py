@@ -18,16 +18,16 @@ class _Progress(NamedTuple):
     state: the environment's state, episodes on the last axis of every leaf
     alive: [N] whether the episode is still running
     nonfinite: [N] whether it left the finite numbers
-    left: [N] how many steps it may still take; None where the horizon alone bounds them
+    steps_left: [N] how many steps it may still take; None where the horizon alone bounds them
     """
 
     state: Any
     alive: jax.Array
     nonfinite: jax.Array
-    left: jax.Array | None
+    steps_left: jax.Array | None
 
 
-def rollout(
+def vmap_rollout(
     env: Environment,
     act: Act,
     actor: PyTree,
@@ -74,12 +74,17 @@ def rollout(
     # Inside, episodes are the last axis: each scalar of the state is a contiguous row.
     start = jax.vmap(functools.partial(episode.begin, env), out_axes=(-1, 0))
     state, noise_keys = start(episode.episode_keys(key, num_episodes))
+    # Where no episode takes the mode, none is computed: a training's updates.
     modes = None if deterministic is False else jnp.broadcast_to(deterministic, num_episodes)
     step = functools.partial(_step, env_step, act, distribution, actor, modes)
-    none = jnp.zeros(num_episodes, bool)
-    left = None if limit is None else jnp.broadcast_to(limit, num_episodes)
-    alive = none | active if left is None else active & (left > 0)
-    progress = _Progress(state, alive, none, left)
+    no_episode = jnp.zeros(num_episodes, bool)
+    if limit is None:
+        steps_left = None
+        alive = no_episode | active
+    else:
+        steps_left = jnp.broadcast_to(limit, num_episodes)
+        alive = active & (steps_left > 0)
+    progress = _Progress(state, alive, nonfinite=no_episode, steps_left=steps_left)
     records = _empty_records(step, progress, distribution, horizon)
     progress, (observation, action, reward, mask), simulated = episode.play_chunks(
         lambda noise, progress: lax.scan(step, progress, noise),
@@ -113,15 +118,16 @@ def _step(
       The progress, and the records of the step: observation [O, N], action [N, A], reward [N] and
       whether the episode was running before it [N].
     """
-    state, alive, nonfinite, left = progress
-    played = episode.step(env_step, act, distribution, actor, state, noise, alive, deterministic)
-    state = episode.hold(alive, played.state, state)
-    record = (played.observation, played.action, played.reward, alive)
-    goes_on = played.alive
-    if left is not None:
-        left = left - 1
-        goes_on &= left > 0
-    return _Progress(state, goes_on, nonfinite | played.broken, left), record
+    state, alive, nonfinite, steps_left = progress
+    result = episode.step(env_step, act, distribution, actor, state, noise, alive, deterministic)
+    state = episode.hold(alive, result.state, state)
+    # The mask is of the episodes that ran before the step: their last step counts.
+    record = (result.observation, result.action, result.reward, alive)
+    alive = result.alive
+    if steps_left is not None:
+        steps_left = steps_left - 1
+        alive &= steps_left > 0
+    return _Progress(state, alive, nonfinite | result.broken, steps_left), record
 
 
 def _empty_records(

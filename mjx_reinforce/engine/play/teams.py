@@ -3,6 +3,7 @@
 import ctypes
 from typing import Any
 
+from mjx_reinforce.engine.base import PhysicsModel
 from mjx_reinforce.engine.gpu import nvrtc
 from mjx_reinforce.engine.gpu.team_kernel import Physics
 
@@ -16,46 +17,57 @@ _SHARED_OF_BLOCK = 97
 
 def why_not(env: Any) -> str | None:
     """Returns in one line why teams do not play an environment; None if they do."""
-    model = getattr(innermost(env), "mj_model", None)
+    model = physics_model(env)
     if model is None:
         return "it simulates no model of MuJoCo's"
-    if model.nv < _LEAST_DOFS:
+    if model.mj_model.nv < _LEAST_DOFS:
         return f"a thread plays a model of fewer than {_LEAST_DOFS} degrees of freedom faster"
     from mjx_reinforce.engine.team import tables  # imports MuJoCo
 
-    return tables.why(model) or (None if nvrtc.library() else nvrtc.version())
+    if reason := tables.why(model.mj_model):
+        return reason
+    # Without the library its version is what to install.
+    return None if nvrtc.library() else nvrtc.version()
 
 
 def played_by(env: Any) -> str:
     """Returns what plays an episode of an environment on a GPU, for people."""
-    why = why_not(env)
-    return f"a thread an episode ({why})" if why else f"{_lanes(env)} lanes an episode"
+    model = physics_model(env)
+    reason = why_not(env)
+    if model is None or reason:
+        return f"a thread an episode ({reason})"
+    return f"{_lanes(model)} lanes an episode"
 
 
-def physics_of(env: Any) -> Physics:
-    """Returns the physics of an environment that teams play."""
-    from mjx_reinforce.engine.team import tables
-
-    env = innermost(env)
-    model, shared = env.mj_model, _shared_memory()
-    text, far = tables.physics_text(model), tables.far_words(model)
-    return Physics(text, far, env.frame_skip, _lanes(env), shared)
-
-
-def _lanes(env: Any) -> int:
-    """Returns how many lanes play an episode."""
-    return 32 if innermost(env).mj_model.nv >= _WIDE else 16
-
-
-def innermost(env: Any) -> Any:
-    """Returns the environment that wrappers are around."""
+def physics_model(env: Any) -> PhysicsModel | None:
+    """Returns what an environment simulates, within wrappers too; None if it does not offer it."""
     while hasattr(env, "env"):
         env = env.env
-    return env
+    offer = getattr(env, "physics_model", None)
+    return None if offer is None else offer()
+
+
+def team_physics(model: PhysicsModel) -> Physics:
+    """Returns the physics of a model that teams play."""
+    from mjx_reinforce.engine.team import tables
+
+    return Physics(
+        text=tables.physics_text(model.mj_model),
+        far=tables.far_words(model.mj_model),
+        skip=model.frame_skip,
+        lanes=_lanes(model),
+        shared=_shared_memory(),
+    )
+
+
+def _lanes(model: PhysicsModel) -> int:
+    """Returns how many lanes play an episode."""
+    return 32 if model.mj_model.nv >= _WIDE else 16
 
 
 def _shared_memory() -> int:
     """Returns how many bytes of shared memory a block may have."""
-    cuda, found = ctypes.CDLL("libcuda.so.1"), ctypes.c_int()
-    cuda.cuDeviceGetAttribute(ctypes.byref(found), _SHARED_OF_BLOCK, 0)
-    return found.value
+    driver = ctypes.CDLL("libcuda.so.1")
+    num_bytes = ctypes.c_int()
+    driver.cuDeviceGetAttribute(ctypes.byref(num_bytes), _SHARED_OF_BLOCK, 0)
+    return num_bytes.value

@@ -37,30 +37,49 @@ def tanh_network(layers: Sequence[Mapping[str, jax.Array]], x: jax.Array) -> jax
     """
     layers = list(layers)
     if is_kept_whole():
-        for number, layer in enumerate(layers):
-            name = "tanh_layer" if number + 1 < len(layers) else "layer"
-            weights = layer["kernel"], layer["bias"]
-            shape = jax.ShapeDtypeStruct(weights[1].shape, jnp.result_type(x, *weights))
-            x = whole(name, {"units": shape}, x, *weights)["units"]
-        return x
+        return _whole_network(layers, x)
     while len(layers) > 1:
-        first, second, *layers = layers
-        size = len(first["bias"])
-        together = math.gcd(size, _UNITS_AT_ONCE)
-        weights = first["kernel"].T, first["bias"], second["kernel"]
-        rows = [w.reshape(size // together, together, *w.shape[1:]) for w in weights]
-        bias = second["bias"].astype(jnp.result_type(x, *weights, second["bias"]))
+        layer, next_layer, *layers = layers
+        num_units = len(layer["bias"])
+        # A scan has iterations of one size alone: a divisor of the number of units.
+        group = math.gcd(num_units, _UNITS_AT_ONCE)
+        weights = layer["kernel"].T, layer["bias"], next_layer["kernel"]
+        rows = [w.reshape(num_units // group, group, *w.shape[1:]) for w in weights]
+        bias = next_layer["bias"].astype(jnp.result_type(x, *weights, next_layer["bias"]))
         # Of a function that it knows, JAX takes the body that it traced before, with its x.
         x, _ = lax.scan(functools.partial(_add_units, x), bias, rows)
-        x = jnp.tanh(x) if layers else x
-    return jnp.dot(x, layers[0]["kernel"]) + layers[0]["bias"] if layers else x
+        # Without further layers this was the last one, which is linear.
+        if layers:
+            x = jnp.tanh(x)
+    if not layers:
+        return x
+    return jnp.dot(x, layers[0]["kernel"]) + layers[0]["bias"]
+
+
+def _whole_network(layers: Sequence[Mapping[str, jax.Array]], x: jax.Array) -> jax.Array:
+    """Returns what ``tanh_network`` does, in an operation a layer, which device code computes."""
+    for number, layer in enumerate(layers):
+        name = "tanh_layer" if number + 1 < len(layers) else "layer"
+        weights = layer["kernel"]
+        bias = layer["bias"]
+        units = jax.ShapeDtypeStruct(bias.shape, jnp.result_type(x, weights, bias))
+        x = whole(name, {"units": units}, x, weights, bias)["units"]
+    return x
 
 
 def _add_units(
     x: jax.Array, sums: jax.Array, weights: Sequence[jax.Array]
 ) -> tuple[jax.Array, None]:
-    """Adds a few units of a layer to all units of the next."""
-    units = [jnp.tanh(jnp.dot(x, into) + bias) for into, bias in zip(*weights[:2], strict=True)]
-    for unit, out in zip(units, weights[2], strict=True):
-        sums = sums + unit * out
+    """Adds a few units of a layer to all units of the next, for ``lax.scan``.
+
+    Args:
+      x: [I] what the layer reads.
+      sums: [O] the next layer's, of its bias and of the units before.
+      weights: of G units: into them [G, I], their bias [G], and out of them [G, O].
+    """
+    weights_in, biases, weights_out = weights
+    units = [jnp.tanh(jnp.dot(x, row) + bias) for row, bias in zip(weights_in, biases, strict=True)]
+    # One unit after the other, in order: a matrix product would be free to add up otherwise.
+    for unit, row in zip(units, weights_out, strict=True):
+        sums = sums + unit * row
     return sums, None

@@ -42,8 +42,8 @@ from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive as Unsupport
 from mjx_reinforce.engine.scalar.jaxprs import prune as prune
 from mjx_reinforce.engine.scalar.primitives import any_lane as any_lane
 from mjx_reinforce.engine.scalar.primitives import is_written_out as is_written_out
-from mjx_reinforce.engine.scalar.primitives import owners as owners
 from mjx_reinforce.engine.scalar.primitives import short_scan as short_scan
+from mjx_reinforce.engine.scalar.primitives import simulated_models as simulated_models
 from mjx_reinforce.engine.scalar.primitives import skippable as skippable
 from mjx_reinforce.engine.scalar.primitives import whole as whole
 from mjx_reinforce.engine.scalar.primitives import writing_out as writing_out

@@ -165,7 +165,7 @@ _WHOLE.def_abstract_eval(
 
 
 def whole(
-    name: str, results: Mapping[str, Any], *args: jax.Array, owner: str = ""
+    name: str, results: Mapping[str, Any], *args: jax.Array, model: str = ""
 ) -> dict[str, jax.Array]:
     """Calls an operation that a backend knows by its name, where ``is_kept_whole``.
 
@@ -173,19 +173,19 @@ def whole(
       name: of the operation.
       results: of its results by name, their shapes and dtypes.
       *args: its operands.
-      owner: whose operation it is, as ``hex(id(env))``; "" if it is everybody's.
+      model: the digest of the ``PhysicsModel`` that it simulates; "" if it simulates none.
     """
     facts = tuple((field, x.shape, np.dtype(x.dtype)) for field, x in results.items())
-    arrays = _WHOLE.bind(*args, name=name, results=facts, owner=owner)
+    arrays = _WHOLE.bind(*args, name=name, results=facts, model=model)
     return dict(zip(results, arrays, strict=True))
 
 
-def owners(traced: jaxprs.Program) -> Iterator[str]:
-    """Yields, once a call, whose operations a program calls by their names."""
+def simulated_models(traced: jaxprs.Program) -> Iterator[str]:
+    """Yields, once a call, the digests of the models that a program simulates by ``whole``."""
     for eqn in traced.jaxpr.eqns:
-        if eqn.primitive is _WHOLE and eqn.params["owner"]:
-            yield eqn.params["owner"]
-        yield from itertools.chain(*map(owners, jaxprs.subprograms(eqn.params.values())))
+        if eqn.primitive is _WHOLE and eqn.params["model"]:
+            yield eqn.params["model"]
+        yield from itertools.chain(*map(simulated_models, jaxprs.subprograms(eqn.params.values())))
 
 
 @jax.custom_batching.custom_vmap

@@ -31,7 +31,7 @@ from mjx_reinforce.engine.contract import check_environment, check_shape
 from mjx_reinforce.engine.memory import gigabytes, host_memory
 from mjx_reinforce.engine.play.available import GENERATOR
 from mjx_reinforce.engine.play.choice import MapEngine, map_function
-from mjx_reinforce.engine.play.counter import key_of
+from mjx_reinforce.engine.play.counter import key_of_words
 
 #: When an environment whose episode has ended begins the next (Gymnasium's ``AutoresetMode``).
 AUTORESETS = ("next_step", "same_step", "disabled")
@@ -101,29 +101,33 @@ def advance_function(env: Environment, limit: int | None, autoreset: str) -> Cal
     """
 
     def advance(state: VectorState, action: PyTree, begins: jax.Array) -> VectorState:
+        """Plays a step or begins an episode; with ``same_step`` it does both where one ends."""
         if autoreset == "same_step":
             after = _play(env, limit, state, action)
             start = lax.cond(begins | after.done, lambda: _begin(env, state.keys), lambda: after)
-            kept = after.replace(simulation=start.simulation, keys=start.keys)
-            return jax.tree.map(lambda x, y: jnp.where(begins, x, y), start, kept)
-        over = begins | (state.done if autoreset == "next_step" else False)
-        begin, play = (lambda: _begin(env, state.keys)), (lambda: _play(env, limit, state, action))
-        return lax.cond(over, begin, play)
+            # Reward, flags and the last observation stay those of the step that ended the episode.
+            restarted = after.replace(simulation=start.simulation, keys=start.keys)
+            return jax.tree.map(lambda x, y: jnp.where(begins, x, y), start, restarted)
+        resets = begins | (state.done if autoreset == "next_step" else False)
+        return lax.cond(
+            resets, lambda: _begin(env, state.keys), lambda: _play(env, limit, state, action)
+        )
 
     return advance
 
 
 def _begin(env: Environment, keys: jax.Array) -> VectorState:
     """Returns an environment at the start of its next episode, of keys as of ``VectorState``."""
-    key, reset_key = jax.random.split(key_of(keys))
+    key, reset_key = jax.random.split(key_of_words(keys))
     start = env.reset(reset_key)
-    none, zero = jnp.zeros((), bool), jnp.zeros_like(start.reward)
+    false = jnp.zeros((), bool)
+    zero = jnp.zeros_like(start.reward)
     return VectorState(
         simulation=start,
         reward=zero,
-        terminated=none,
-        truncated=none,
-        nonfinite=none,
+        terminated=false,
+        truncated=false,
+        nonfinite=false,
         final_obs=start.obs,
         metrics=dict(getattr(start, "metrics", {})),
         episode_return=zero,
@@ -140,13 +144,16 @@ def _play(env: Environment, limit: int | None, state: VectorState, action: PyTre
     finite &= jnp.isfinite(after.done)
     reward = jnp.where(finite, after.reward, 0)
     length = jnp.where(over, 0, state.episode_length) + 1
-    truncated = cut = _time_is_up(after)
+    # ``done`` of a time limit of the environment's own is no termination; of the task's it is one,
+    # also where that comes with the last step of ``limit``.
+    own_limit = _time_is_up(after)
+    truncated = own_limit
     if limit is not None:
         truncated |= length >= limit
     return VectorState(
         simulation=after,
         reward=reward,
-        terminated=((after.done != 0) & ~cut) | ~finite,
+        terminated=((after.done != 0) & ~own_limit) | ~finite,
         truncated=truncated,
         nonfinite=~finite,
         final_obs=after.obs,
@@ -163,8 +170,10 @@ def _time_is_up(state: Any) -> jax.Array:
     brax's and Playground's ``EpisodeWrapper`` set ``done`` then, and tell why.
     """
     info = getattr(state, "info", None)
-    told = info.get("truncation", 0) if isinstance(info, Mapping) else 0
-    return jnp.asarray(told) != 0
+    truncation = 0
+    if isinstance(info, Mapping):
+        truncation = info.get("truncation", 0)
+    return jnp.asarray(truncation) != 0
 
 
 #: Copies of the states that a step has in memory: 4.6 of HalfCheetah, a million of them.
@@ -206,14 +215,19 @@ class VectorEnv:
         engine: str,
     ):
         """Compiles the step; the arguments are those of ``make_vec``."""
-        self.env, self.num_envs, self.autoreset = env, num_envs, autoreset
+        self.env = env
+        self.num_envs = num_envs
+        self.autoreset = autoreset
         self.max_episode_steps = max_episode_steps
         self.action_space: Box | Discrete = action_space(env)
         self._blank = blank(env)
-        none = null_action(env)
-        self._null_action = np.asarray(none, jnp.result_type(float) if none.ndim else none.dtype)
+        # What is continuous is in JAX's precision, float64 where ``jax_enable_x64`` is set.
+        zeros = null_action(env)
+        dtype = jnp.result_type(float) if zeros.ndim else zeros.dtype
+        self._null_action = np.asarray(zeros, dtype)
         self.observation_size = int(self._blank.final_obs.shape[0])
         self.action_size = env.action_size
+        # Before the step is compiled, which takes seconds to minutes.
         self._check_memory()
         advance = advance_function(env, max_episode_steps, autoreset)
         flag = jax.ShapeDtypeStruct((), bool)
@@ -232,20 +246,19 @@ class VectorEnv:
           ValueError: it is no key, or of another generator than JAX's default.
         """
         check_key(key)
-        key = (
-            key if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(key)
-        )
-        made_by = str(jax.random.key_impl(key))
-        if made_by != GENERATOR:
+        if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+            key = jax.random.wrap_key_data(key)
+        generator = str(jax.random.key_impl(key))
+        if generator != GENERATOR:
             raise ValueError(
-                f"the key is of the generator {made_by}; make it with "
+                f"the key is of the generator {generator}; make it with "
                 f'jax.random.key(seed, impl="{GENERATOR}")'
             )
         words = jax.random.key_data(episode.episode_keys(key, self.num_envs))
-        state = jax.tree.map(
-            lambda x: jnp.zeros((self.num_envs, *x.shape), x.dtype), self._blank
-        ).replace(keys=words)
-        return self._advance(state, self._null_actions(), True)
+        # A reset is the step of a blank state that all environments begin in: one program for both,
+        # which is compiled once.
+        zeros = jax.tree.map(lambda x: jnp.zeros((self.num_envs, *x.shape), x.dtype), self._blank)
+        return self._advance(zeros.replace(keys=words), self._null_actions(), True)
 
     def step(self, state: VectorState, action: jax.Array) -> VectorState:
         """Returns the environments one step later.
@@ -267,27 +280,31 @@ class VectorEnv:
         """Returns the environments with new episodes where a mask [N] says so; others stay."""
         check_shape("the mask", where, (self.num_envs,))
         where = jnp.asarray(where, bool)
-        begun = self._advance(state, self._null_actions(), where)
+        # The others have taken a step in there, which is thrown away.
+        restarted = self._advance(state, self._null_actions(), where)
         return jax.tree.map(
             lambda new, old: jnp.where(where.reshape(-1, *[1] * (new.ndim - 1)), new, old),
-            begun,
+            restarted,
             state,
         )
 
     def sample_actions(self, key: jax.Array) -> jax.Array:
         """Returns random actions [N, A] or [N]: uniform, and normal where there is no bound."""
         check_key(key)
-        space, shape = self.action_space, (self.num_envs, self.action_size)
+        space = self.action_space
         if isinstance(space, Discrete):
-            return jax.random.randint(key, shape[:1], 0, space.num_actions)
+            return jax.random.randint(key, (self.num_envs,), 0, space.num_actions)
+        shape = (self.num_envs, self.action_size)
         uniform_key, normal_key = jax.random.split(key)
         uniform = jax.random.uniform(uniform_key, shape)
+        normal = jax.random.normal(normal_key, shape)
+        # Unbounded entries are 0 to 1 here, so that nothing is computed with infinities; in the end
+        # they are the normal ones.
         bounded = np.isfinite(space.low) & np.isfinite(space.high)
-        low, high = np.where(bounded, space.low, 0), np.where(bounded, space.high, 1)
+        low = np.where(bounded, space.low, 0)
+        high = np.where(bounded, space.high, 1)
         within = jnp.asarray(low) + uniform * (high - low)
-        return jnp.where(bounded, within, jax.random.normal(normal_key, shape)).astype(
-            uniform.dtype
-        )
+        return jnp.where(bounded, within, normal).astype(uniform.dtype)
 
     def check_state(self, state: object) -> None:
         """Raises ValueError for what is no state of these environments: machine code trusts it."""
@@ -295,9 +312,9 @@ class VectorEnv:
             raise ValueError(
                 f"the state must be what reset or step returned, got a {type(state).__name__}"
             )
-        same = jax.tree.structure(state) == jax.tree.structure(self._blank)
+        same_tree = jax.tree.structure(state) == jax.tree.structure(self._blank)
         pairs = zip(jax.tree.leaves(state), jax.tree.leaves(self._blank), strict=False)
-        if not same or any(
+        if not same_tree or any(
             jnp.shape(x) != (self.num_envs, *y.shape) or jnp.result_type(x) != y.dtype
             for x, y in pairs
         ):
@@ -319,24 +336,28 @@ class VectorEnv:
     def _checked(self, action: ArrayLike) -> jax.Array:
         """Returns the actions, or raises ValueError where they are none."""
         check_shape("the actions", action, (self.num_envs, *self._null_action.shape))
-        kind, wanted = jnp.result_type(action), self._null_action.dtype
-        if not jnp.can_cast(kind, wanted, "same_kind"):
-            raise ValueError(f"the actions must be {wanted}, got {kind}")
-        return jnp.asarray(action, wanted)
+        dtype = jnp.result_type(action)
+        own_dtype = self._null_action.dtype
+        if not jnp.can_cast(dtype, own_dtype, "same_kind"):
+            raise ValueError(f"the actions must be {own_dtype}, got {dtype}")
+        return jnp.asarray(action, own_dtype)
 
     def _check_memory(self) -> None:
         """Raises ValueError for more environments than there is memory for."""
-        each = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(self._blank))
-        needed, there = _COPIES * each * self.num_envs, _memory()
-        if needed > there:
+        state_bytes = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(self._blank))
+        required_bytes = _COPIES * state_bytes * self.num_envs
+        memory_bytes = _memory()
+        if required_bytes > memory_bytes:
             raise ValueError(
-                f"{self.num_envs:,} environments need {gigabytes(needed)}, and there are "
-                f"{gigabytes(there)}; make at most {int(there / _COPIES / each):,}"
+                f"{self.num_envs:,} environments need {gigabytes(required_bytes)}, and there are "
+                f"{gigabytes(memory_bytes)}; make at most "
+                f"{int(memory_bytes / _COPIES / state_bytes):,}"
             )
 
 
 def _memory() -> float:
     """Returns the bytes of memory of the device that JAX computes on."""
+    # A CPU's devices have no statistics.
     stats = jax.devices()[0].memory_stats() or {}
     return float(stats.get("bytes_limit", host_memory()))
 

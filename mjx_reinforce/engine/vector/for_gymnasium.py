@@ -62,14 +62,17 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError(f"{type(vec.env).__name__} has no MuJoCo model to render")
         if render_mode:
             check_drawing()
-        self.vec, self.num_envs, self.render_mode = vec, vec.num_envs, render_mode
+        self.vec = vec
+        self.num_envs = vec.num_envs
+        self.render_mode = render_mode
         self.state: VectorState | None = None
-        dt = getattr(vec.env, "dt", None)
         self.metadata = {
             "autoreset_mode": AutoresetMode[vec.autoreset.upper()],
             "render_modes": ["rgb_array"],
-            **({"render_fps": round(1 / dt)} if dt else {}),
         }
+        # A task whose steps have no duration, such as one without physics, has no rate of pictures.
+        if dt := getattr(vec.env, "dt", None):
+            self.metadata["render_fps"] = round(1 / dt)
         self.single_observation_space = gymnasium.spaces.Box(
             -np.inf, np.inf, (vec.observation_size,), np.float32
         )
@@ -77,8 +80,10 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         batch = gymnasium.vector.utils.batch_space
         self.observation_space = batch(self.single_observation_space, self.num_envs)
         self.action_space = batch(self.single_action_space, self.num_envs)
-        self._arrays, self._out = arrays, _HAND_OUT[arrays]
-        self._reset, self._restart = jax.jit(vec.reset), jax.jit(vec.restart)
+        self._arrays = arrays
+        self._out = _HAND_OUT[arrays]
+        self._reset = jax.jit(vec.reset)
+        self._restart = jax.jit(vec.restart)
         # What is handed out without a copy must outlive the next step.
         self._step = jax.jit(vec.step, donate_argnums=0 if arrays == "numpy" else ())
         self._renderer: Renderer | None = None
@@ -98,12 +103,13 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
           The observations [N, O] and an empty dict.
         """
         self._check_open()
-        options = {} if options is None else dict(options)
+        options = dict(options or {})
         mask = options.pop("reset_mask", None)
         if options:
             raise ValueError(f"unknown option {', '.join(map(repr, options))}; known: 'reset_mask'")
+        # Only the first reset and one with a seed draw keys anew: the environments have their own.
         if mask is not None:
-            state = self._reset_some(seed, np.asarray(mask))
+            state = self._reset_masked(seed, np.asarray(mask))
         elif seed is None and self.state is not None:
             state = self._restart(self.state, np.ones(self.num_envs, bool))
         else:
@@ -128,8 +134,13 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             ``autoreset="disabled"`` an episode has ended and nobody has reset its environment.
         """
         state = self.advance(actions)
-        flags = self._out(state.terminated), self._out(state.truncated)
-        return self._out(state.obs), self._out(state.reward), *flags, self._info(state)
+        return (
+            self._out(state.obs),
+            self._out(state.reward),
+            self._out(state.terminated),
+            self._out(state.truncated),
+            self._info(state),
+        )
 
     def advance(self, actions: PyTree) -> VectorState:
         """Plays one step as ``step`` does, and returns the environments in JAX.
@@ -178,16 +189,20 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0])
         if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
+            # Gymnasium's class seeds its own generator, ``np_random``.
             super().reset(seed=int(seed))
             return _keys_of(range(int(seed), int(seed) + self.num_envs))
         if not isinstance(seed, list | tuple | np.ndarray) or len(seed) != self.num_envs:
             raise ValueError(
                 f"seed must be a whole number, or a list of {self.num_envs}, one each, got {seed!r}"
             )
-        drawn = np.random.SeedSequence().generate_state(self.num_envs)
-        return _keys_of([int(d if s is None else s) for s, d in zip(seed, drawn, strict=True)])
+        # None in the list draws a seed of that environment at random.
+        random_seeds = np.random.SeedSequence().generate_state(self.num_envs)
+        pairs = zip(seed, random_seeds, strict=True)
+        return _keys_of([int(drawn if chosen is None else chosen) for chosen, drawn in pairs])
 
-    def _reset_some(self, seed: Seeds, mask: np.ndarray) -> VectorState:
+    def _reset_masked(self, seed: Seeds, mask: np.ndarray) -> VectorState:
+        """Returns the environments with new episodes where a mask [N] says so, of seeds if any."""
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
             raise ValueError(
                 f"options['reset_mask'] must be a bool array [{self.num_envs}], got {mask!r}"
@@ -195,6 +210,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         if self.state is None:
             raise ValueError("the first reset must be of all environments: leave reset_mask out")
         state = self.state
+        # ``restart`` draws from the keys in the state: those of a seed take their place.
         if seed is not None:
             keys = jax.random.key_data(self._keys(seed))
             state = state.replace(keys=jnp.where(mask[:, None], keys, state.keys))  # pyright: ignore
@@ -204,6 +220,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         """Returns actions as JAX takes them, or raises ValueError where they are none."""
         if type(actions).__module__.partition(".")[0] == "torch":
             actions = jnp.from_dlpack(actions.detach().contiguous())
+        # Arrays on the device are not looked at: that would wait for the step which makes them.
         if isinstance(actions, jax.Array):
             return actions
         actions = np.asarray(actions)
@@ -218,32 +235,41 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             if actions.dtype.kind in "iu" and np.any(wrong):
                 raise ValueError(f"actions must be 0 to {space.n - 1}, got {actions[wrong][0]}")
         elif actions.dtype.kind == "f" and not np.all(np.isfinite(actions)):
-            first = tuple(int(x) for x in np.argwhere(~np.isfinite(actions))[0])
-            raise ValueError(f"actions must be finite numbers, got {actions[first]} at {first}")
-        return actions.astype(np.float32) if actions.dtype == np.float64 else actions
+            index = tuple(int(x) for x in np.argwhere(~np.isfinite(actions))[0])
+            raise ValueError(f"actions must be finite numbers, got {actions[index]} at {index}")
+        # The action space is float32, and NumPy's numbers are float64 unless one says otherwise.
+        if actions.dtype == np.float64:
+            return actions.astype(np.float32)
+        return actions
 
     def _info(self, state: VectorState) -> dict[str, Any]:
         """Returns what Gymnasium keeps apart: entries by name, each with a mask behind "_"."""
-        told = {name: self._out(x) for name, x in state.metrics.items()}
-        everywhere = np.ones(self.num_envs, bool)
+        terms = {name: self._out(x) for name, x in state.metrics.items()}
+        # With ``same_step`` the observation is a new start's where an episode has ended. What that
+        # one left is in "final_info" then, and masked out beside it.
         ended = np.asarray(state.done) & (self.vec.autoreset == "same_step")
-        info: dict[str, Any] = told | {f"_{name}": ~ended for name in told}
+        info: dict[str, Any] = terms | {f"_{name}": ~ended for name in terms}
         if ended.any():
-            final = told | {f"_{name}": ended for name in told}
-            info |= {"final_info": final, "_final_info": ended}
-            info |= {"final_obs": self._final(state, ended), "_final_obs": ended}
-        broken = np.asarray(state.nonfinite)
-        return info | {"nonfinite": broken, "_nonfinite": everywhere} if broken.any() else info
+            info["final_info"] = terms | {f"_{name}": ended for name in terms}
+            info["_final_info"] = ended
+            info["final_obs"] = self._final_observations(state, ended)
+            info["_final_obs"] = ended
+        nonfinite = np.asarray(state.nonfinite)
+        if nonfinite.any():
+            info["nonfinite"] = nonfinite
+            info["_nonfinite"] = np.ones(self.num_envs, bool)
+        return info
 
-    def _final(self, state: VectorState, ended: np.ndarray) -> Any:
+    def _final_observations(self, state: VectorState, ended: np.ndarray) -> Any:
         """Returns the last observations; in NumPy an array of arrays and None, as Gymnasium has."""
         if self._arrays != "numpy":
             return self._out(state.final_obs)
         rows = np.asarray(state.final_obs)
-        found = np.full(self.num_envs, None, object)
+        observations = np.full(self.num_envs, None, object)
+        # One by one: NumPy would take an array of arrays for a matrix.
         for i in np.flatnonzero(ended):
-            found[i] = rows[i]
-        return found
+            observations[i] = rows[i]
+        return observations
 
 
 def _keys_of(seeds: Sequence[int]) -> jax.Array:
@@ -253,8 +279,10 @@ def _keys_of(seeds: Sequence[int]) -> jax.Array:
 
 
 def _space(vec: VectorEnv) -> gymnasium.Space:
+    """Returns the actions of one environment as Gymnasium's space."""
     space = vec.action_space
     if isinstance(space, Discrete):
         return gymnasium.spaces.Discrete(space.num_actions)
-    low, high = np.asarray(space.low, np.float32), np.asarray(space.high, np.float32)
+    low = np.asarray(space.low, np.float32)
+    high = np.asarray(space.high, np.float32)
     return gymnasium.spaces.Box(low, high, dtype=np.float32)

@@ -31,14 +31,18 @@ class Renderer:
         model = copy.copy(model)
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
         model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-        model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.4, 0.6
+        # Brighter than MuJoCo's own, of 0.1 and 0.4: also what is in the shade is seen.
+        model.vis.headlight.ambient[:] = 0.4
+        model.vis.headlight.diffuse[:] = 0.6
         # Without a GPU smooth edges take half the time of a picture, and show no better in it.
         model.vis.quality.offsamples = 0
         # Without a GPU a fine shadow takes half the time of a picture, and shows no better in it.
         model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, max(width, height))
-        self._robot, self._camera = _traveler(model), _camera(model)
+        self._robot = _traveler(model)
+        self._camera = _camera(model)
         extended = self._robot is not None and _lay_endless_floors(model)
-        self._model, self._data = model, mujoco.MjData(model)
+        self._model = model
+        self._data = mujoco.MjData(model)
         self._renderer = mujoco.Renderer(model, height, width)
         if extended:  # without a white line at the horizon, which nobody asked for
             self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = False
@@ -51,16 +55,18 @@ class Renderer:
         Args:
           qpos: [nq] generalized positions.
         """
-        mujoco, model, data = import_mujoco(), self._model, self._data
+        mujoco = import_mujoco()
+        model = self._model
+        data = self._data
         data.qpos[:] = qpos
         mujoco.mj_forward(model, data)
         if self._robot is not None:
-            place = data.subtree_com[self._robot]
+            center = data.subtree_com[self._robot]
             if self._camera.type == mujoco.mjtCamera.mjCAMERA_FREE:
-                self._camera.lookat[:] = place
+                self._camera.lookat[:] = center
             # Where a sun is decides only how far its shadows reach.
             suns = model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-            data.light_xpos[suns, :2] += place[:2]
+            data.light_xpos[suns, :2] += center[:2]
         # MuJoCo lays an endless floor around the camera of the scene before, which may be far away.
         mujoco.mjv_updateCamera(model, data, self._camera, self._renderer.scene)
         self._renderer.update_scene(data, self._camera)
@@ -74,10 +80,13 @@ def _traveler(model: "MjModel") -> int | None:
     """
     mujoco = import_mujoco()
     robot = model.jnt_bodyid[0] if model.njnt else -1
-    ways = (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE) | (
+    # A free joint goes anywhere, and so does a slider without an end, as a planar walker's.
+    travels = (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE) | (
         (model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & (model.jnt_limited == 0)
     )
-    return int(robot) if ways[model.jnt_bodyid == robot].any() else None
+    if not travels[model.jnt_bodyid == robot].any():
+        return None
+    return int(robot)
 
 
 def _camera(model: "MjModel") -> Any:
@@ -87,7 +96,8 @@ def _camera(model: "MjModel") -> Any:
     mujoco.mjv_defaultFreeCamera(model, camera)
     for number in range(model.ncam):
         if model.camera(number).name == "track":
-            camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, number
+            camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+            camera.fixedcamid = number
     return camera
 
 
@@ -99,14 +109,16 @@ def _lay_endless_floors(model: "MjModel") -> bool:
     mujoco = import_mujoco()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
+    # A plane with sizes of 0 has no ends already.
     planes = (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (model.geom_size[:, :2] > 0).any(1)
     of_the_world = model.body_weldid[model.geom_bodyid] == 0
     floors = planes & of_the_world & (data.geom_xmat[:, 8] > _UPWARD)
     if not floors.any():
         return False
     textured = floors & (model.geom_matid >= 0)
-    materials, first = np.unique(model.geom_matid[textured], return_index=True)
-    sizes = model.geom_size[textured][first, :2]
+    # Floors may share a material, whose texture has one scale: that of the first of them.
+    materials, indices = np.unique(model.geom_matid[textured], return_index=True)
+    sizes = model.geom_size[textured][indices, :2]
     # A texture is repeated so often from side to side, or, without sides, every two meters.
     by_size = ~model.mat_texuniform[materials]
     model.mat_texrepeat[materials[by_size]] /= np.where(sizes > 0, sizes, 1)[by_size]
@@ -117,8 +129,9 @@ def _lay_endless_floors(model: "MjModel") -> bool:
 
 def import_mujoco() -> Any:
     """Returns MuJoCo; without a screen it is told to draw through EGL, where that is installed."""
-    unseen = not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL")
-    if unseen and "mujoco" not in sys.modules:  # where it asks, once
+    without_screen = not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL")
+    # MuJoCo reads the variable once, when it is imported.
+    if without_screen and "mujoco" not in sys.modules:
         os.environ.setdefault("MUJOCO_GL", "egl")
     import mujoco
 
@@ -132,7 +145,8 @@ def check_drawing() -> None:
             mujoco = import_mujoco()
             mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
     except Exception as error:  # each of MuJoCo's backends has its own
-        how = f"with MUJOCO_GL={chosen}" if (chosen := os.environ.get("MUJOCO_GL")) else "here"
+        backend = os.environ.get("MUJOCO_GL")
+        how = f"with MUJOCO_GL={backend}" if backend else "here"
         raise ValueError(
             f"MuJoCo cannot draw {how} ({error}); set MUJOCO_GL=egl, or MUJOCO_GL=osmesa without a "
             "GPU, and install what is missing (Debian: apt install libegl1 libosmesa6)"

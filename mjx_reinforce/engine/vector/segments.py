@@ -122,19 +122,21 @@ def unroll(
     vec.check_state(state)
     check_key(key)
     check_count("num_steps", num_steps)
-    one = jax.ShapeDtypeStruct(state.obs.shape[1:], state.obs.dtype)
-    check_policy(act, params, distribution, one)
+    observation = jax.ShapeDtypeStruct(state.obs.shape[1:], state.obs.dtype)
+    check_policy(act, params, distribution, observation)
     if not isinstance(distribution, ActsWithLogProb):
         raise ValueError(f"distribution must have the function log_prob, got {distribution!r}")
-    waits = vec.autoreset == "next_step"
+    resets_take_steps = vec.autoreset == "next_step"
 
     def step(state: VectorState, key: jax.Array) -> tuple[VectorState, Segment]:
-        observation, over = state.obs, state.done
-        outputs = jax.vmap(act, (None, 0))(params, observation)
+        """Plays one step, and returns what was played in it, for ``lax.scan``."""
+        outputs = jax.vmap(act, (None, 0))(params, state.obs)
         action = distribution.sample(outputs, distribution.noise(key, (vec.num_envs,)))
         after = vec.step(state, action)
+        # What had ended before the step began its next episode instead, and ignored the action.
+        played = ~state.done if resets_take_steps else jnp.ones_like(state.done)
         return after, Segment(
-            observation=observation,
+            observation=state.obs,
             action=action,
             log_prob=distribution.log_prob(outputs, action),
             reward=after.reward,
@@ -142,11 +144,11 @@ def unroll(
             truncated=after.truncated,
             nonfinite=after.nonfinite,
             next_observation=after.final_obs,
-            played=~over if waits else jnp.ones_like(over),
+            played=played,
             metrics=after.metrics,
             episode_return=after.episode_return,
             episode_length=after.episode_length,
         )
 
-    result: Any = lax.scan(step, state, jax.random.split(key, num_steps))
-    return result
+    state_and_segment: Any = lax.scan(step, state, jax.random.split(key, num_steps))
+    return state_and_segment

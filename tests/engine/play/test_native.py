@@ -1,4 +1,4 @@
-"""The native engine plays the same episodes as `rollouts.rollout`, in machine code."""
+"""The native engine plays the same episodes as `rollouts.vmap_rollout`, in machine code."""
 
 import functools
 import re
@@ -59,7 +59,7 @@ def test_a_limit_for_each_episode():
 def test_no_lane_waits():
     """Lengths from 4 to 84, a lane's next episode of any seed: nearly all that is played counts."""
     env = Drifting()
-    got = played(native.rollout, env, actor_and_act(env, ()), num_seeds=64, num_episodes=32)
+    got = played(native.native_rollout, env, actor_and_act(env, ()), num_seeds=64, num_episodes=32)
     lengths = got.mask.sum(axis=1)
     assert lengths.max() > 4 * lengths.min()
     assert lengths.sum() > 0.9 * got.simulated.sum()
@@ -72,7 +72,7 @@ def test_only_active_episodes_are_played():
     chosen[1] = False
     options = {"horizon": 60, "deterministic": np.arange(40) % 2 == 0}
     some = only_active(
-        native.rollout, Drifting(), actor_and_act(Drifting(), (5,)), chosen, **options
+        native.native_rollout, Drifting(), actor_and_act(Drifting(), (5,)), chosen, **options
     )
     assert (some.simulated > 0).tolist() == [True, False, True]
 
@@ -82,9 +82,9 @@ def test_episodes_have_keys_of_their_own():
     env, keys = Drifting(), jax.random.split(jax.random.key(1), 9)
     actor, act, distribution = actor_and_act(env, (5,))
     size = {"num_episodes": 9, "horizon": 60}
-    whole = native.rollout(env, act, actor, distribution, keys, **size)
+    whole = native.native_rollout(env, act, actor, distribution, keys, **size)
     size["num_episodes"] = 4
-    some = native.rollout(env, act, actor, distribution, keys[::-2][:4], **size)
+    some = native.native_rollout(env, act, actor, distribution, keys[::-2][:4], **size)
     for name in ("observation", "action", "reward", "mask"):
         want = getattr(whole, name)[:, ::-2][:, :4]
         np.testing.assert_array_equal(getattr(some, name), want, err_msg=name)
@@ -94,11 +94,11 @@ def test_episodes_have_keys_of_their_own():
 def test_steps_are_counted_for_the_seed_that_a_lane_played():
     """A lane waits for the longest episode; lanes without any count nothing."""
     env = Drifting()
-    got = played(native.rollout, env, actor_and_act(env, ()), num_seeds=2, num_episodes=2)
+    got = played(native.native_rollout, env, actor_and_act(env, ()), num_seeds=2, num_episodes=2)
     lengths = got.mask.sum(axis=1)
     assert len(np.unique(lengths)) > 1
     np.testing.assert_array_equal(got.simulated, 2 * lengths.max())
-    many = played(native.rollout, env, actor_and_act(env, ()), num_episodes=200, threads=1)
+    many = played(native.native_rollout, env, actor_and_act(env, ()), num_episodes=200, threads=1)
     assert many.simulated.sum() % machine.this_machine().lanes == 0
     assert np.all(many.simulated >= many.mask.sum((1, 2)))
 
@@ -118,7 +118,7 @@ def test_a_nan_stays_in_its_lane():
     player = actor_and_act(Breaking(), (4,))
     got, want = both(Breaking(), player, num_episodes=20)
     assert_same_episodes(got, want, rounding=2e-5)
-    alone = played(native.rollout, Drifting(), player, num_episodes=20)
+    alone = played(native.native_rollout, Drifting(), player, num_episodes=20)
     reached = alone.observation[:, 1:, :, 0]
     high, low = (reached > 0.75).any(axis=1), (reached < -0.75).any(axis=1)
     assert (low & ~high).any()
@@ -211,9 +211,9 @@ def test_keys_of_another_generator():
 
     with pytest.warns(UserWarning, match="the key is of rbg; vmap plays it"):
         got = play(engine.rollout)
-    assert_same_episodes(got, play(rollouts.rollout), rounding=0)
+    assert_same_episodes(got, play(rollouts.vmap_rollout), rounding=0)
     with pytest.raises(ValueError, match=r'of rbg; make .*impl="threefry2x32"'):
-        play(native.rollout)
+        play(native.native_rollout)
 
 
 @pytest.mark.cpu
@@ -259,11 +259,11 @@ def test_the_number_of_lanes_and_threads_changes_nothing(monkeypatch):
     """More episodes than lanes, and fewer; they end at different steps."""
     env, here = Drifting(), machine.this_machine()
     player, options = actor_and_act(env, ()), {"num_episodes": 7, "horizon": 40}
-    want = played(native.rollout, env, player, **options)
+    want = played(native.native_rollout, env, player, **options)
     assert len(np.unique(want.mask.sum(axis=1))) > 3
     for lanes, threads in ((here.lanes, 1), (here.lanes, 2), (2, 0)):
         monkeypatch.setattr(machine, "this_machine", lambda lanes=lanes: here._replace(lanes=lanes))
-        play = functools.partial(native.rollout, threads=threads)
+        play = functools.partial(native.native_rollout, threads=threads)
         got = played(play, env, player, **options)
         for name in ("observation", "action", "reward", "mask", "nonfinite"):
             np.testing.assert_array_equal(getattr(got, name), getattr(want, name), err_msg=name)

@@ -52,8 +52,8 @@ def test_the_same_episodes_as_everywhere(env, distribution, monkeypatch):
     want = None
     for threads in (1, 3):
         gpu_on_cpu.emulate(monkeypatch, threads)
-        got = played(native.rollout, env, who, **options)
-        want = want or played(rollouts.rollout, env, who, **options)
+        got = played(native.native_rollout, env, who, **options)
+        want = want or played(rollouts.vmap_rollout, env, who, **options)
         assert got.action.dtype == want.action.dtype
         assert got.mask[:, 0].all()
         assert not got.mask[:, -1].all()
@@ -71,7 +71,7 @@ def test_episodes_that_are_not_active_are_not_played(busy, monkeypatch):
     for threads in (1, 3):
         block = gpu_on_cpu.Block(threads)
         gpu_on_cpu.emulate(monkeypatch, block=block)
-        some = only_active(native.rollout, *busy, chosen, **options)
+        some = only_active(native.native_rollout, *busy, chosen, **options)
         assert block.apart is None
         assert not some.simulated[[0, 2]].any()
         lengths = some.mask[1].sum(axis=0)
@@ -85,13 +85,13 @@ def test_in_step_or_apart_an_episode_is_the_same(busy, monkeypatch):
     Threads of a block meet at one place, also where their episodes have ended.
     """
     gpu_on_cpu.emulate(monkeypatch)
-    want = played(native.rollout, *busy, horizon=30)
+    want = played(native.native_rollout, *busy, horizon=30)
     meetings = []
     for long in (10**9, 4, 0):
         block = gpu_on_cpu.Block(3)
         gpu_on_cpu.emulate(monkeypatch, block=block)
         monkeypatch.setattr(kernels, "LONG", long)
-        got = played(native.rollout, *busy, horizon=30)
+        got = played(native.native_rollout, *busy, horizon=30)
         assert block.apart is None
         meetings.append(block.meetings)
         assert_identical(got, want)
@@ -105,13 +105,13 @@ def test_threads_meet_where_some_have_no_room_for_their_contacts(monkeypatch):
     who = actor_and_act(env, ())
     size = {"num_episodes": 12, "horizon": 2}
     gpu_on_cpu.emulate(monkeypatch)
-    want = played(native.rollout, env, who, **size)
+    want = played(native.native_rollout, env, who, **size)
     touch = want.observation[:, 1, :, -3:].sum(axis=-1)
     assert {0, 1, 2} <= {*touch.ravel().astype(int)}
     block = gpu_on_cpu.Block(3)
     gpu_on_cpu.emulate(monkeypatch, block=block)
     monkeypatch.setattr(kernels, "LONG", 0)
-    assert_identical(played(native.rollout, env, who, **size), want)
+    assert_identical(played(native.native_rollout, env, who, **size), want)
     assert block.apart is None
 
 
@@ -176,7 +176,7 @@ def test_one_launch_for_all_seeds_in_loops(busy, monkeypatch):
     env, (actor, act, distribution) = busy
 
     def one(key):
-        return native.rollout(env, act, actor, distribution, key, num_episodes=8, horizon=50)
+        return native.native_rollout(env, act, actor, distribution, key, num_episodes=8, horizon=50)
 
     def repeated(keys):
         def body(keys, _):

@@ -50,7 +50,7 @@ def test_what_xla_compiled_meanwhile_waits_for_it(slow, tmp_path):
     code = items.load(tmp_path)
     seam.register(code)
     play = jax.jit(lambda active: items.play(code, active)).lower(jnp.array(ACTIVE)).compile()
-    assert not code.made.done()
+    assert not code.future_addresses.done()
     assert not list(tmp_path.iterdir())
     threading.Timer(0.2, go_on.set).start()
     began = time.monotonic()
@@ -103,8 +103,8 @@ def test_where_no_other_process_starts_this_one_compiles(monkeypatch, tmp_path):
     monkeypatch.setattr(machine, "_LOADED", {})
     monkeypatch.setattr(sys, "executable", "")
     code = items.load()
-    assert isinstance(code.made, Future)
-    assert code.made.done()
+    assert isinstance(code.future_addresses, Future)
+    assert code.future_addresses.done()
 
 
 def test_a_process_that_is_killed_is_an_error(monkeypatch, tmp_path):

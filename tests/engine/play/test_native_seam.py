@@ -316,7 +316,7 @@ NUMBERS = itertools.count(20)
 def kept_code(tmp_path, monkeypatch):
     """Code that is on disk, of which this process forgets how it is called."""
     monkeypatch.setattr(objects, "folder", lambda: tmp_path)
-    monkeypatch.setattr(seam, "_KNOWN", set())
+    monkeypatch.setattr(seam, "_REGISTERED", set())
     monkeypatch.setattr(machine, "_LOADED", {})
     return items.load(tmp_path, lanes=next(NUMBERS))
 

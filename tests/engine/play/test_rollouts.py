@@ -51,7 +51,7 @@ def act(actor, observation):
 def play(env, key=None, *, num_episodes=4, horizon=6, distribution=Plain, act=act, **options):
     options = {"num_episodes": num_episodes, "horizon": horizon} | options
     key = jax.random.key(0) if key is None else key
-    roll = jax.jit(functools.partial(rollouts.rollout, env, act, **options), static_argnums=1)
+    roll = jax.jit(functools.partial(rollouts.vmap_rollout, env, act, **options), static_argnums=1)
     return jax.tree.map(np.asarray, roll(jnp.array([0.1, 2.0]), distribution, key))
 
 
@@ -125,7 +125,7 @@ def test_only_active_episodes_are_played():
     """Seeds side by side, each with a choice of its own."""
     chosen = np.array([[True, False, True, False], [False] * 4, [True] * 4])
     player = jnp.array([0.1, 2.0]), act, Plain
-    only_active(rollouts.rollout, Counter(length=8), player, chosen, horizon=100)
+    only_active(rollouts.vmap_rollout, Counter(length=8), player, chosen, horizon=100)
     none = play(Counter(length=8), active=False)
     assert not any(np.any(x) for x in jax.tree.leaves(none))
 
@@ -210,7 +210,7 @@ def test_seeds_side_by_side_are_each_its_own():
     actor = jnp.array([0.1, 2.0])
 
     def roll(key, active):
-        return rollouts.rollout(
+        return rollouts.vmap_rollout(
             env, act, actor, Plain, key, num_episodes=2, horizon=100, active=active
         )
 
@@ -253,16 +253,16 @@ def test_numbers_from_a_count_on_are_those_of_a_longer_draw():
 
 def test_bits_of_any_width_and_shape_and_doubles():
     for dtype in (np.uint8, np.uint16, np.uint32):
-        ours = jax.random.bits(counter.key_of(WORDS), (2, 3), dtype)
+        ours = jax.random.bits(counter.key_of_words(WORDS), (2, 3), dtype)
         np.testing.assert_array_equal(ours, jax.random.bits(KEY, (2, 3), dtype))
         assert ours.dtype == dtype
     with jax.enable_x64(True):
-        ours = jax.random.normal(counter.key_of(WORDS), (4,), np.float64)
+        ours = jax.random.normal(counter.key_of_words(WORDS), (4,), np.float64)
         np.testing.assert_array_equal(ours, jax.random.normal(KEY, (4,), np.float64))
 
 
 def test_keys_made_of_keys():
-    ours, theirs = counter.key_of(WORDS), KEY
+    ours, theirs = counter.key_of_words(WORDS), KEY
     for _ in range(2):
         ours, theirs = jax.random.split(ours, 3)[2], jax.random.split(theirs, 3)[2]
         ours, theirs = jax.random.fold_in(ours, 5), jax.random.fold_in(theirs, 5)

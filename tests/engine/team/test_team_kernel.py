@@ -41,9 +41,9 @@ def test_teams_play_the_same_episodes(teams, name):
     env, horizon = envs.make(name), 4 if name == "Ant-v5" else 120
     player = actor_and_act(env, (5,))
     options = {"num_seeds": 2, "horizon": horizon, "deterministic": np.arange(5) % 2 == 1}
-    want = played(native.rollout, env, player, **options)
+    want = played(native.native_rollout, env, player, **options)
     made = teams()
-    got = played(native.rollout, env, player, **options)
+    got = played(native.native_rollout, env, player, **options)
     assert [kernel.lanes for kernel in made] == [16, 16]  # one plays, one begins
     first = min(horizon, 12)  # steps until rounding has grown
     for name in ("observation", "action", "reward"):
@@ -58,7 +58,7 @@ def test_teams_play_only_active_episodes(teams):
     env = envs.make("Hopper-v5")
     chosen = np.arange(15).reshape(3, 5) % 2 == 1
     made, player = teams(), actor_and_act(env, ())
-    some = only_active(native.rollout, env, player, chosen, horizon=20).mask.any(1)
+    some = only_active(native.native_rollout, env, player, chosen, horizon=20).mask.any(1)
     assert (some.tolist(), {kernel.lanes for kernel in made}) == (chosen.tolist(), {16})
 
 
