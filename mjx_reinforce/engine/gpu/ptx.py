@@ -28,8 +28,9 @@ from mjx_reinforce.engine.gpu.kernel import ENTRY
 TRIPLE = "nvptx64-nvidia-cuda"
 #: What finds a kernel's threads and blocks.
 _BOUNDS = r"\.maxntid (\d+)", r"\.minnctapersm (\d+)"
+_VERSION = r"\.version (\d+\.\d+)"
 #: What GPUs of compute capability 7.0 need. For one that it does not know, LLVM writes 3.2.
-_VERSION, _LEAST_VERSION = r"\.version (\d+\.\d+)", 6.0
+_LEAST_VERSION = 6.0
 #: The first line of CUDA C++: lanes of a team, threads and shared memory of a block, scratch.
 _TEAM = "// teams of {}, {} threads, {} bytes, scratch = {}\n"
 _LOADED: dict[str, "Kernel"] = {}
@@ -81,9 +82,9 @@ def load_kernel(
 
     with _LOCK:
         if key not in _LOADED:
-            found = objects.kept(key, folder)
-            made = found or objects.make(key, folder, write(), compile)
-            _LOADED[key] = described(key, made.decode(), compiled=not found)
+            cached = objects.kept(key, folder)
+            content = cached or objects.make(key, folder, write(), compile)
+            _LOADED[key] = described(key, content.decode(), compiled=not cached)
         return _LOADED[key]
 
 
@@ -99,14 +100,14 @@ def in_memory() -> list[str]:
 
 def kept(key: str, folder: Path) -> Kernel | None:
     """Returns a kernel by its key; None if it is not on disk."""
-    found = objects.read_object(folder, key)
-    return described(key, found.decode(), compiled=False) if found else None
+    content = objects.read_object(folder, key)
+    return described(key, content.decode(), compiled=False) if content else None
 
 
 def described(key: str, text: str, *, compiled: bool) -> Kernel:
     """Returns the kernel of a text, which says how it is launched."""
-    if found := re.match(_TEAM.format(*[r"(\d+)"] * 4), text):
-        lanes, threads, shared, words = map(int, found.groups())
+    if match := re.match(_TEAM.format(*[r"(\d+)"] * 4), text):
+        lanes, threads, shared, words = map(int, match.groups())
         return Kernel(key, text, threads, 1, words, compiled, lanes, shared)
     threads, blocks = (int(re.findall(x, text)[0]) for x in _BOUNDS)
     return Kernel(key, text, threads, blocks, 0, compiled)
@@ -117,8 +118,9 @@ def _compile(text: str, capability: str) -> str:
     import llvmlite
     import llvmlite.binding as llvm
 
-    if called := re.findall(r"^declare double @(\w+)\(", text, re.M):
-        raise scalar.UnsupportedPrimitive(f"{', '.join(called)}: no kernel for GPUs computes it")
+    # A GPU has no C library. What LLVM has itself is declared as @llvm..., which \w does not match.
+    if functions := re.findall(r"^declare double @(\w+)\(", text, re.M):
+        raise scalar.UnsupportedPrimitive(f"{', '.join(functions)}: no kernel for GPUs computes it")
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
     target = llvm.Target.from_triple(TRIPLE).create_target_machine(
@@ -138,8 +140,10 @@ def _compile(text: str, capability: str) -> str:
 def _with_xla_divisions(text: str) -> str:
     """Returns PTX with division as XLA's GPU programs have it, within 2 units in the last place."""
     replaced = text.replace("div.rn.ftz.f32", "div.full.ftz.f32")
-    left = re.search(r"\bdiv\.rn\S*\.f32", replaced)
-    assert left is None, f"LLVM has another name for a division: {left}"
+    # One that is rounded correctly is a subroutine of many instructions: it would go unnoticed, and
+    # slow every kernel, if a later LLVM spelled divisions otherwise.
+    exact_division = re.search(r"\bdiv\.rn\S*\.f32", replaced)
+    assert exact_division is None, f"LLVM has another name for a division: {exact_division}"
     return replaced
 
 
@@ -166,10 +170,11 @@ def launcher(key: str) -> tuple[int, int]:
 
     The slot is a pointer to ``cuLaunchKernel`` and the kernel; a launch waits while it is null.
     """
+    # The key is in the text so that each kernel has a module, and with it a slot, of its own.
     text = f"; launches {key}\n{handler.with_entry(_TEXT, {})}"
-    names, target = ("handler", "slot"), machine.this_machine()
-    found = machine.load_module(text, lambda: text, names, target, None).addresses
-    return found["handler"], found["slot"]
+    names = ("handler", "slot")
+    code = machine.load_module(text, lambda: text, names, machine.this_machine(), None)
+    return code.addresses["handler"], code.addresses["slot"]
 
 
 def fill(slot: int, kernel: Kernel, assemblers: Sequence[Assembler], folder: Path | None) -> None:
@@ -191,21 +196,22 @@ def fill(slot: int, kernel: Kernel, assemblers: Sequence[Assembler], folder: Pat
             objects.describe(kernel.key, f"not by {assembler.name}: {error}")
     launch = ctypes.cast(cuda.cuLaunchKernel, ctypes.c_void_p)
     _FILLED.append((ctypes.c_void_p * 3)(launch, ready, kernel.shared))
+    # Last of all, as a launch in another thread reads all three once the slot is not null.
     ctypes.c_void_p.from_address(slot).value = ctypes.addressof(_FILLED[-1])
 
 
 def _machine_code(kernel: Kernel, assembler: Assembler, folder: Path | None) -> bytes:
     """Returns the machine code of a kernel, assembled unless the disk has it."""
     key = hashlib.sha256(f"2 {kernel.key} {assembler.name}".encode()).hexdigest()
-    if found := objects.kept(key, folder):
-        return found
-    began = time.perf_counter()
-    log, made = assembler.assemble(kernel.text)
-    seconds = time.perf_counter() - began
+    if cached := objects.kept(key, folder):
+        return cached
+    start = time.perf_counter()
+    log, machine_code = assembler.assemble(kernel.text)
+    seconds = time.perf_counter() - start
     objects.describe(kernel.key, f"{assembler.name} took {seconds:.2f} s: {log}")
     if folder:
-        objects.write_object(folder, key, made)
-    return made
+        objects.write_object(folder, key, machine_code)
+    return machine_code
 
 
 def _in_memory(cuda: ctypes.CDLL, image: bytes, shared: int) -> ctypes.c_void_p:
@@ -216,12 +222,15 @@ def _in_memory(cuda: ctypes.CDLL, image: bytes, shared: int) -> ctypes.c_void_p:
       image: machine code, or PTX.
       shared: bytes of shared memory that a block is launched with.
     """
-    library, kernel = ctypes.c_void_p(), ctypes.c_void_p()
-    nothing = None, None, 0
-    if status := cuda.cuLibraryLoadData(ctypes.byref(library), image, *nothing, *nothing):
+    library = ctypes.c_void_p()
+    kernel = ctypes.c_void_p()
+    # Neither options of the driver's compiler nor of the library: names, values, and how many.
+    no_options = None, None, 0
+    if status := cuda.cuLibraryLoadData(ctypes.byref(library), image, *no_options, *no_options):
         raise RuntimeError(f"cuLibraryLoadData returned {status}")
     if status := cuda.cuLibraryGetKernel(ctypes.byref(kernel), library, ENTRY.encode()):
         raise RuntimeError(f"cuLibraryGetKernel returned {status}")
+    # Without the attribute, a launch that asks for more than 48 KiB of shared memory is an error.
     if shared:
         count = ctypes.c_int()
         cuda.cuDeviceGetCount(ctypes.byref(count))
@@ -240,14 +249,17 @@ def assemblers(capability: str) -> tuple[Assembler, ...]:
         ctypes.CDLL("libcuda.so.1")
     except OSError:
         return ()
-    found = []
+    programs = []
     for path in _programs():
         with contextlib.suppress(OSError, subprocess.SubprocessError):
-            said = subprocess.run([path, "--version"], capture_output=True, text=True, check=True)
-            name = f"ptxas, {said.stdout.strip().splitlines()[-1]}"
+            process = subprocess.run(
+                [path, "--version"], capture_output=True, text=True, check=True
+            )
+            name = f"ptxas, {process.stdout.strip().splitlines()[-1]}"
             assemble = functools.partial(_by_program, path, capability)
-            found.append(Assembler(name, assemble))
-    return (*found, Assembler("the driver", lambda text: ("", text.encode() + b"\0")))
+            programs.append(Assembler(name, assemble))
+    # Any driver assembles PTX when it loads it: the last resort.
+    return (*programs, Assembler("the driver", lambda text: ("", text.encode() + b"\0")))
 
 
 def compiler(capability: str) -> Assembler:
@@ -259,17 +271,18 @@ def _programs() -> list[str]:
     """Returns where ptxas is: that of pip, which JAX brings, on PATH, in CUDA's folder."""
     nvidia = importlib.util.find_spec("nvidia")
     folders = map(Path, (nvidia and nvidia.submodule_search_locations) or [])
-    found = [str(path) for folder in folders for path in sorted(folder.glob("cu*/bin/ptxas"))]
+    of_pip = [str(path) for folder in folders for path in sorted(folder.glob("cu*/bin/ptxas"))]
     cuda = f"{os.environ.get('CUDA_HOME', '')}/bin"
-    return [*found, *filter(None, (shutil.which("ptxas"), shutil.which("ptxas", path=cuda)))]
+    of_system = shutil.which("ptxas"), shutil.which("ptxas", path=cuda)
+    return of_pip + [path for path in of_system if path]
 
 
 def _by_program(path: str, capability: str, text: str) -> tuple[str, bytes]:
     """Assembles PTX with ptxas."""
     architecture = f"-arch=sm_{capability.replace('.', '')}"
     command = [path, "-v", architecture, "/dev/stdin", "-o", "/dev/stdout"]
-    done = subprocess.run(command, input=text.encode(), capture_output=True)
-    log = done.stderr.decode(errors="replace")
-    if done.returncode:
-        raise RuntimeError(f"ptxas returned {done.returncode}: {' '.join(log.split())[:300]}")
-    return log, done.stdout
+    process = subprocess.run(command, input=text.encode(), capture_output=True)
+    log = process.stderr.decode(errors="replace")
+    if process.returncode:
+        raise RuntimeError(f"ptxas returned {process.returncode}: {' '.join(log.split())[:300]}")
+    return log, process.stdout
