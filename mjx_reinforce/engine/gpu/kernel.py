@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_reinforce.engine.episode import NOT_PLAYED
+from mjx_reinforce.engine.gpu.source import Facts, Source
 from mjx_reinforce.engine.llvm.emit import LLVM, Input, Value
 from mjx_reinforce.engine.llvm.text import Text
 from mjx_reinforce.engine.scalar import scalarized
@@ -33,15 +34,15 @@ CONTROLS = ("sizes", "limits", "keys")
 RESULTS = ("observation", "action", "reward", "length", "broken", "simulated", "next")
 #: The arguments of a step behind the actor and the state: keys, t, deterministic.
 _NUM_OTHERS = 3
-#: A block's threads, and how many blocks a multiprocessor holds at once, for programs that fit into
-#: its instruction caches and for longer ones. A thread has 128 registers, in a longer program 255.
-_SHORT_BLOCKS = (32, 16)
-_LONG_BLOCKS = (256, 1)
+#: For programs that fit into a multiprocessor's instruction caches: a thread has 128 registers.
+_SHORT = Facts(threads=32, blocks=16)
+#: For longer ones: a thread has 255 registers.
+_LONG = Facts(threads=256, blocks=1)
 #: XLA's buffers begin at multiples of more bytes. A thread loads as many at once.
 _BUFFER_ALIGN = 16
 #: Denormals are zero, as in machine code for CPUs.
 _ATTRIBUTES = """attributes #0 = {{ "denormal-fp-math-f32"="preserve-sign"
-  "nvvm.maxntid"="{}" "nvvm.minctasm"="{}" }}
+  "nvvm.maxntid"="{facts.threads}" "nvvm.minctasm"="{facts.blocks}" }}
 """
 
 
@@ -125,11 +126,11 @@ class Lockstep(LLVM):
         self._together = before
 
 
-def entry_text(text: Text, parameters: Sequence[str], written: scalarized.Scalarized) -> str:
+def entry_source(text: Text, parameters: Sequence[str], written: scalarized.Scalarized) -> Source:
     """Returns the kernel of a body, with the bounds of its threads."""
-    blocks = _LONG_BLOCKS if _is_long(written.schedule) else _SHORT_BLOCKS
+    facts = _LONG if _is_long(written.schedule) else _SHORT
     kernel = text.function(f"ptx_kernel void @{ENTRY}({', '.join(parameters)}) #0")
-    return kernel + _ATTRIBUTES.format(*blocks) + LOOP_FACTS
+    return Source("llvm", kernel + _ATTRIBUTES.format(facts=facts) + LOOP_FACTS, facts)
 
 
 class _Leaf(NamedTuple):
@@ -140,7 +141,7 @@ class _Leaf(NamedTuple):
     size: int
 
 
-def kernel_text(step: scalarized.Scalarized, num_actor: int) -> str:
+def kernel_text(step: scalarized.Scalarized, num_actor: int) -> Source:
     """Returns the LLVM IR of ``@play``, without a target.
 
     Its arguments are pointers to: sizes [3] int32 (seeds S, episodes N, steps T), limits [S, N]
@@ -189,7 +190,7 @@ class _Kernel:
             self.text.reserve(_INT, 1) for _ in range(5)
         )
 
-    def write(self) -> str:
+    def write(self) -> Source:
         """Returns the kernel."""
         text = self.text
         self.seeds, self.episodes, self.horizon = (
@@ -227,7 +228,7 @@ class _Kernel:
         # XLA passes the zeros that the results are written over as arguments, too.
         parameters += [f"ptr %zero.{name}" for name in RESULTS]
         parameters += [f"ptr %{name}" for name in RESULTS]
-        return entry_text(text, parameters, self.step)
+        return entry_source(text, parameters, self.step)
 
     def _fetch(self, items: str) -> None:
         """Writes how a thread takes the next episode that is played, if there is one."""
@@ -354,7 +355,7 @@ def _copy(text: Text, source: str, row: str, leaf: _Leaf, count: int) -> None:
         text.store(value, text.at(leaf.pointer, leaf.dtype, k), leaf.dtype)
 
 
-def mapping_text(written: scalarized.Scalarized) -> str:
+def mapping_text(written: scalarized.Scalarized) -> Source:
     """Returns the LLVM IR of ``@play``, without a target.
 
     Its arguments are pointers to: sizes [2] int32 (examples N, threads in all), the leaves [N, ...]
@@ -408,4 +409,4 @@ def mapping_text(written: scalarized.Scalarized) -> str:
     parameters = ["ptr noalias readonly %sizes"]
     parameters += [f"ptr noalias readonly %argument{k}" for k in arguments]
     parameters += [f"ptr %result{k}" for k in results]
-    return entry_text(text, parameters, written)
+    return entry_source(text, parameters, written)

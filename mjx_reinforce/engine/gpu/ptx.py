@@ -9,6 +9,7 @@ import ctypes
 import functools
 import hashlib
 import importlib.util
+import json
 import os
 import re
 import shutil
@@ -23,16 +24,13 @@ from mjx_reinforce.engine import objects, scalar
 from mjx_reinforce.engine.cpu import handler, machine
 from mjx_reinforce.engine.gpu import nvrtc
 from mjx_reinforce.engine.gpu.kernel import ENTRY
+from mjx_reinforce.engine.gpu.source import Facts, Language, Source
 
 #: LLVM's name of NVIDIA's GPUs.
 TRIPLE = "nvptx64-nvidia-cuda"
-#: What finds a kernel's threads and blocks.
-_BOUNDS = r"\.maxntid (\d+)", r"\.minnctapersm (\d+)"
 _VERSION = r"\.version (\d+\.\d+)"
 #: What GPUs of compute capability 7.0 need. For one that it does not know, LLVM writes 3.2.
 _LEAST_VERSION = 6.0
-#: The first line of CUDA C++: lanes of a team, threads and shared memory of a block, scratch.
-_TEAM = "// teams of {}, {} threads, {} bytes, scratch = {}\n"
 _LOADED: dict[str, "Kernel"] = {}
 _LOCK = threading.Lock()
 
@@ -41,33 +39,32 @@ class Kernel(NamedTuple):
     """A kernel as PTX, or as CUDA C++ for teams of lanes.
 
     key: a name for all that it depends on
+    language: "ptx" or "cuda"
     text: its entry is "play"
-    threads: of a block, at most
-    blocks: on a multiprocessor; its registers are as many as that leaves each thread
-    scratch: 4-byte words of a buffer that each thread needs
+    facts: how it is launched
     compiled: whether it was compiled now, and not read from disk
-    lanes: threads that play an episode together
-    shared: bytes of shared memory of a block
     """
 
     key: str
+    language: Language
     text: str
-    threads: int
-    blocks: int
-    scratch: int
+    facts: Facts
     compiled: bool
-    lanes: int = 1
-    shared: int = 0
+
+    @property
+    def source(self) -> Source:
+        """What its machine code is made of."""
+        return Source(self.language, self.text, self.facts)
 
 
 def load_kernel(
-    source: str, write: Callable[[], str], capability: str, folder: Path | None
+    source: str, write: Callable[[], Source], capability: str, folder: Path | None
 ) -> Kernel:
     """Returns a kernel, compiled unless memory or disk has it.
 
     Args:
       source: all that the text of the kernel depends on, or a hash of it.
-      write: returns LLVM IR, such as ``kernel.kernel_text``, or CUDA C++ as ``team_text``.
+      write: returns LLVM IR, such as ``kernel.kernel_text``, or CUDA C++, which is compiled later.
       capability: the compute capability of the GPU, such as "9.0".
       folder: where kernels are kept; None keeps none.
 
@@ -76,21 +73,29 @@ def load_kernel(
       RuntimeError: the text is no LLVM IR, or this LLVM has no code for such a GPU.
     """
     key = objects.key_of(capability, source)
-
-    def compile(text: str) -> bytes:
-        return (text if text.startswith(_TEAM[:8]) else _compile(text, capability)).encode()
-
     with _LOCK:
         if key not in _LOADED:
             cached = objects.kept(key, folder)
-            content = cached or objects.make(key, folder, write(), compile)
-            _LOADED[key] = described(key, content.decode(), compiled=not cached)
+            content = cached or _make(key, folder, write(), capability)
+            _LOADED[key] = described(key, content, compiled=not cached)
         return _LOADED[key]
 
 
-def team_text(text: str, lanes: int, threads: int, shared: int, scratch: int) -> str:
-    """Returns CUDA C++ with what ``Kernel`` says of it."""
-    return _TEAM.format(lanes, threads, shared, scratch) + text
+def _make(key: str, folder: Path | None, source: Source, capability: str) -> bytes:
+    """Returns a kernel as it is kept: a line of JSON, then its text."""
+
+    def compile(text: str) -> bytes:
+        language = source.language
+        if language == "llvm":
+            language = "ptx"
+            text = _compile(text, capability)
+        else:
+            # NVRTC compiles it where it is launched: with the macros of its facts, not in its text.
+            text = source.text
+        head = {"language": language, **source.facts._asdict()}
+        return f"{json.dumps(head)}\n{text}".encode()
+
+    return objects.make(key, folder, source.for_compiler(), compile)
 
 
 def in_memory() -> list[str]:
@@ -101,16 +106,15 @@ def in_memory() -> list[str]:
 def kept(key: str, folder: Path) -> Kernel | None:
     """Returns a kernel by its key; None if it is not on disk."""
     content = objects.read_object(folder, key)
-    return described(key, content.decode(), compiled=False) if content else None
+    return described(key, content, compiled=False) if content else None
 
 
-def described(key: str, text: str, *, compiled: bool) -> Kernel:
-    """Returns the kernel of a text, which says how it is launched."""
-    if match := re.match(_TEAM.format(*[r"(\d+)"] * 4), text):
-        lanes, threads, shared, words = map(int, match.groups())
-        return Kernel(key, text, threads, 1, words, compiled, lanes, shared)
-    threads, blocks = (int(re.findall(x, text)[0]) for x in _BOUNDS)
-    return Kernel(key, text, threads, blocks, 0, compiled)
+def described(key: str, content: bytes, *, compiled: bool) -> Kernel:
+    """Returns a kernel from what is kept of it, whose first line says what it is."""
+    line, _, text = content.decode().partition("\n")
+    head = json.loads(line)
+    language = head.pop("language")
+    return Kernel(key, language, text, Facts(**head), compiled)
 
 
 def _compile(text: str, capability: str) -> str:
@@ -190,12 +194,13 @@ def fill(slot: int, kernel: Kernel, assemblers: Sequence[Assembler], folder: Pat
     ready = ctypes.c_void_p()
     for assembler in assemblers:
         try:
-            ready = _in_memory(cuda, _machine_code(kernel, assembler, folder), kernel.shared)
+            image = _machine_code(kernel, assembler, folder)
+            ready = _in_memory(cuda, image, kernel.facts.shared)
             break
         except Exception as error:  # whatever an assembler or a driver raises
             objects.describe(kernel.key, f"not by {assembler.name}: {error}")
     launch = ctypes.cast(cuda.cuLaunchKernel, ctypes.c_void_p)
-    _FILLED.append((ctypes.c_void_p * 3)(launch, ready, kernel.shared))
+    _FILLED.append((ctypes.c_void_p * 3)(launch, ready, kernel.facts.shared))
     # Last of all, as a launch in another thread reads all three once the slot is not null.
     ctypes.c_void_p.from_address(slot).value = ctypes.addressof(_FILLED[-1])
 
@@ -206,7 +211,7 @@ def _machine_code(kernel: Kernel, assembler: Assembler, folder: Path | None) -> 
     if cached := objects.kept(key, folder):
         return cached
     start = time.perf_counter()
-    log, machine_code = assembler.assemble(kernel.text)
+    log, machine_code = assembler.assemble(kernel.source.for_compiler())
     seconds = time.perf_counter() - start
     objects.describe(kernel.key, f"{assembler.name} took {seconds:.2f} s: {log}")
     if folder:

@@ -18,13 +18,12 @@ import numpy as np
 from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.gpu import nvrtc, ptx
 from mjx_reinforce.engine.gpu import team_kernel as team
+from mjx_reinforce.engine.gpu.source import WARP
 
 #: LLVM 22, which llvmlite 0.48 has, is the first that bounds a kernel's threads and blocks.
 _OLDEST = (22,)
 #: What may assemble a kernel, what is preferred first.
 Assemblers = tuple[ptx.Assembler, ...]
-#: Threads of a warp.
-_WARP = 32
 #: XLA's names of the handlers that it knows.
 _HANDLERS: set[str] = set()
 _LOCK = threading.Lock()
@@ -90,7 +89,9 @@ def _target(key: str) -> str:
 
 def _makers(kernel: ptx.Kernel) -> Assemblers:
     """Returns what makes machine code of a kernel's text, what is preferred first."""
-    return _assemblers()[0] if kernel.lanes == 1 else (ptx.compiler(compute_capability()),)
+    if kernel.language == "cuda":
+        return (ptx.compiler(compute_capability()),)
+    return _assemblers()[0]
 
 
 def _handler(kernel: ptx.Kernel) -> str:
@@ -215,7 +216,7 @@ def _call(
       results: their shapes and dtypes.
     """
     scratch = []
-    if words := kernel.scratch * math.prod(grid):
+    if words := kernel.facts.scratch * math.prod(grid):
         scratch.append(jax.ShapeDtypeStruct((words,), jnp.int32))
     # XLA lets the kernel write over the initial values, rather than copy them.
     aliases = {len(arguments) + k: k for k in range(len(initial))}
@@ -227,9 +228,10 @@ def _call(
 
 def _sized(kernel: ptx.Kernel, items: int) -> tuple[ptx.Kernel, tuple[int, int]]:
     """Returns the kernel, and how many blocks of how many threads, that play so many items."""
-    if kernel.lanes > 1:
+    if kernel.facts.lanes > 1:
         kernel = team.for_items(kernel, items, jax.devices()[0].core_count, compute_capability())
-    return kernel, _grid(items * kernel.lanes, kernel.threads, kernel.blocks)
+    facts = kernel.facts
+    return kernel, _grid(items * facts.lanes, facts.threads, facts.blocks)
 
 
 def _grid(items: int, most: int, blocks: int) -> tuple[int, int]:
@@ -239,5 +241,5 @@ def _grid(items: int, most: int, blocks: int) -> tuple[int, int]:
     """
     processors = jax.devices()[0].core_count
     # A block is whole warps. Few episodes get small blocks, so that each multiprocessor has some.
-    threads = min(_WARP * -(-items // (_WARP * processors)), most)
+    threads = min(WARP * -(-items // (WARP * processors)), most)
     return min(-(-items // threads), blocks * processors), threads

@@ -13,6 +13,7 @@ import numpy as np
 from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.gpu.kernel import CONTROLS, RESULTS
+from mjx_reinforce.engine.gpu.source import WARP, Facts, Source
 from mjx_reinforce.engine.scalar import scalarized
 from mjx_reinforce.engine.scalar.jaxprs import num_entries
 from mjx_reinforce.engine.team.operations import type_of
@@ -106,7 +107,7 @@ extern "C" KERNEL play({parameters}) {{
 """
 
 
-def player_text(written: scalarized.Scalarized, physics: Physics, num_actor: int) -> str:
+def player_text(written: scalarized.Scalarized, physics: Physics, num_actor: int) -> Source:
     """Returns the C++ of a kernel with the arguments of ``gpu.kernel.kernel_text``.
 
     Args:
@@ -197,7 +198,7 @@ def _carried_text(
     return pointers, initial
 
 
-def mapping_text(written: scalarized.Scalarized, physics: Physics) -> str:
+def mapping_text(written: scalarized.Scalarized, physics: Physics) -> Source:
     """Returns the C++ of a kernel with the arguments of ``gpu.kernel.mapping_text``.
 
     Args:
@@ -238,19 +239,19 @@ def _parameters(inputs: Iterable[tuple[str, str]], results: Sequence[tuple[str, 
     return ", ".join([*parameters, "Word* scratch"])
 
 
-def _kernel(physics: Physics, text: CText, loop: str, words: int) -> str:
+def _kernel(physics: Physics, text: CText, loop: str, words: int) -> Source:
     """Returns a kernel whose teams have so many words of scratch each, besides far contacts."""
     # At least one, as a team's scratch is found by this number and XLA has no empty buffer.
     a_thread = max(1, -(-(physics.far + words) // physics.lanes))
-    head = f"#define W {physics.lanes}\n#define SHARED {physics.shared}\n"
-    head += f"#define REPORTS ({' | '.join(text.reports) or 0})\n"
-    head += f"#define FAR_WORDS {physics.far}\n#define THREAD_WORDS {a_thread}\n"
-    whole = f"{_warps(FEW_WARPS)}{head}{physics.text}\n{loop}"
-    return ptx.team_text(whole, physics.lanes, 32 * FEW_WARPS, physics.shared, a_thread)
-
-
-def _warps(number: int) -> str:
-    return f"#define WARPS {number}\n"
+    facts = Facts(
+        threads=WARP * FEW_WARPS,
+        blocks=1,
+        scratch=a_thread,
+        lanes=physics.lanes,
+        shared=physics.shared,
+    )
+    head = f"#define REPORTS ({' | '.join(text.reports) or 0})\n#define FAR_WORDS {physics.far}\n"
+    return Source("cuda", f"{head}{physics.text}\n{loop}", facts)
 
 
 def for_items(kernel: ptx.Kernel, items: int, processors: int, capability: str) -> ptx.Kernel:
@@ -263,11 +264,9 @@ def for_items(kernel: ptx.Kernel, items: int, processors: int, capability: str) 
       capability: the GPU's compute capability.
     """
     # Where a team of the small blocks has one episode at most, more teams would have none.
-    if items * kernel.lanes <= kernel.threads * processors:
+    facts = kernel.facts
+    if items * facts.lanes <= facts.threads * processors:
         return kernel
-
-    def write() -> str:
-        text = kernel.text.partition("\n")[2].replace(_warps(FEW_WARPS), _warps(_MANY_WARPS), 1)
-        return ptx.team_text(text, kernel.lanes, 32 * _MANY_WARPS, kernel.shared, kernel.scratch)
-
-    return ptx.load_kernel(f"{kernel.key} {_MANY_WARPS} warps", write, capability, objects.folder())
+    source = kernel.source._replace(facts=facts._replace(threads=WARP * _MANY_WARPS))
+    name = f"{kernel.key} {_MANY_WARPS} warps"
+    return ptx.load_kernel(name, lambda: source, capability, objects.folder())

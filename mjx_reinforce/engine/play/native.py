@@ -93,7 +93,7 @@ def rollout(
 
 def _begin(env: Environment, program: NativeProgram, keys: jax.Array) -> tuple[Any, jax.Array]:
     """Returns the starts of episodes by their keys [N], and the keys [N] of their noise."""
-    if isinstance(program.code, machine.Code) or program.code.lanes == 1:
+    if isinstance(program.code, machine.Code) or program.code.facts.lanes == 1:
         return jax.vmap(functools.partial(episode.begin, env))(keys)
 
     def begin(words: jax.Array) -> tuple[Any, jax.Array]:
