@@ -14,12 +14,14 @@ import numpy as np
 
 from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.scalar import UnsupportedPrimitive
-from mjx_reinforce.engine.team import supported
+from mjx_reinforce.engine.team import records, supported
+from mjx_reinforce.engine.team.frames import Frame, Inertial, rotation, six, times
+from mjx_reinforce.engine.team.records import Softness
 from mjx_reinforce.engine.team.supported import BALL, BOX, CAPSULE, FREE, HINGE, PLANE, SLIDE, why
 
 _C: Any = mujoco  # a C extension without stubs
 #: The files of the device code, each after those that it uses. What the tables use is before them.
-_BEFORE = ["lanes"]
+_BEFORE = ["lanes", "records"]
 _FILES = [
     "algebra",
     "state",
@@ -49,34 +51,6 @@ _TINY = 1e-15
 _MIN_IMPEDANCE = 1e-4
 _MAX_IMPEDANCE = 1 - 1e-4
 _NO_LIMIT = 1e30
-
-
-class _Frame(NamedTuple):
-    """A place in the frame of a link.
-
-    link: -1 is the world
-    at: [3] (m)
-    quat: [4]
-    """
-
-    link: int
-    at: np.ndarray
-    quat: np.ndarray
-
-    def place(self, at: Any) -> np.ndarray:
-        """Returns a point [3] of this frame in the link's."""
-        return self.at + _rotation(self.quat) @ np.asarray(at)
-
-    def then(self, at: Any, quat: Any) -> "_Frame":
-        """Returns a frame that has this pose in this one."""
-        return _Frame(self.link, self.place(at), _times(self.quat, quat))
-
-
-class _Inertial(NamedTuple):
-    """A body's center of mass [3] (m) and inertia [3, 3] about it, in the frame of its link."""
-
-    com: np.ndarray
-    inertia: np.ndarray
 
 
 class _ContactKind(NamedTuple):
@@ -123,25 +97,6 @@ def far_words(mj_model: MjModel, near: int = NEAR) -> int:
     return words + words % 2  # numbers of 8 bytes may follow
 
 
-def _times(a: Any, b: Any) -> np.ndarray:
-    """Returns the product of two quaternions [4]."""
-    product = np.zeros(4)
-    _C.mju_mulQuat(product, np.asarray(a, float), np.asarray(b, float))
-    return product
-
-
-def _rotation(quat: Any) -> np.ndarray:
-    """Returns the rotation matrix [3, 3] of a quaternion."""
-    matrix = np.zeros(9)
-    _C.mju_quat2Mat(matrix, np.asarray(quat, float))
-    return matrix.reshape(3, 3)
-
-
-def _six(matrix: np.ndarray) -> list[float]:
-    """Returns a symmetric matrix [3, 3] as xx, yy, zz, xy, xz, yz."""
-    return [matrix[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
-
-
 class _Tables:
     """The tables of one model.
 
@@ -160,7 +115,7 @@ class _Tables:
         self.ints: dict[str, Any] = {}
         self.masks: dict[str, Any] = {}
         self.reals: dict[str, Any] = {}
-        self.soft: dict[tuple[float, ...], int] = {}
+        self.soft: dict[Softness, int] = {}
         self.dof_joint = np.asarray(model.dof_jntid)
         self._links()
         self._bodies()
@@ -176,7 +131,7 @@ class _Tables:
         self.constants["NU"] = max(model.nu, 1)
         self.constants["IMPLICIT"] = self._implicit()
         self.constants["RK4"] = int(model.opt.integrator == _C.mjtIntegrator.mjINT_RK4)
-        self.constants["ANY_POWER"] = int(any(x[6] != 2 for x in self.soft))
+        self.constants["ANY_POWER"] = int(any(x.power != 2 for x in self.soft))
         self.reals["soft"] = list(self.soft)
         self.reals["gravity"] = model.opt.gravity
 
@@ -203,9 +158,12 @@ class _Tables:
         ):
             for name, values in fields.items():
                 flat = np.asarray(values).ravel().tolist() or [0]  # C++ has no empty array
-                lines.append(f"  {type_name} {name}[{len(flat)}];")
+                struct = records.STRUCTS.get(name, type_name)
+                numbers = records.size(struct)
+                lines.append(f"  {struct} {name}[{-(-len(flat) // numbers)}];")
                 initial_values.append("{" + ",".join(map(literal, flat)) + "}")
         lines.append("};")
+        lines += records.checks()
         lines.append("#define MODEL_INIT {" + ",\\\n".join(initial_values) + "}")
         return "\n".join(lines)
 
@@ -217,6 +175,13 @@ class _Tables:
         euler = opt.integrator == _C.mjtIntegrator.mjINT_EULER
         return int(euler and self.model.dof_damping.any())
 
+    def _records(self, name: str, order: Any = slice(None), **columns: np.ndarray) -> None:
+        """Makes a table of structs from the columns of their fields, [rows] or [rows, numbers]."""
+        fields = records.FIELDS[records.STRUCTS[name]]
+        assert {*columns} == {*fields}
+        rows = [columns[field].reshape(-1, count) for field, count in fields.items()]
+        self.reals[name] = np.hstack(rows)[order]
+
     def _link_number(self, link: int) -> int:
         """Returns the number of a link in the state: the world is the last."""
         return self.model.njnt if link < 0 else link
@@ -225,7 +190,7 @@ class _Tables:
         """Makes the tables of links, and finds the frames of bodies."""
         model = self.model
         no_turn = np.eye(4)[0]
-        self.frames = [_Frame(-1, np.zeros(3), no_turn)]
+        self.frames = [Frame(-1, np.zeros(3), no_turn)]
         self.parents = []
         rows = []
         for body in range(1, model.nbody):
@@ -243,15 +208,15 @@ class _Tables:
                     parent_link = -1
                 # The pose is linear in these two: for a hinge at angle q, the quaternion is
                 # cos(q/2) quat + sin(q/2) turned; for a slide, the place is at + q turned.
-                turned = _times(frame.quat, [0, *axis])
+                turned = times(frame.quat, [0, *axis])
                 if kind == SLIDE:
-                    turned = [*(_rotation(frame.quat) @ axis), 0]
+                    turned = [*(rotation(frame.quat) @ axis), 0]
                 zero = 0
                 if kind in (HINGE, SLIDE):
                     zero = model.qpos0[model.jnt_qposadr[joint]]
                 rows.append((frame.place(anchor), frame.quat, turned, zero))
                 self.parents.append(parent_link)
-                frame = _Frame(joint, -np.asarray(anchor), no_turn)
+                frame = Frame(joint, -np.asarray(anchor), no_turn)
             self.frames.append(frame)
         kinds = model.jnt_type
         names = ("link_at", "link_quat", "link_turned", "link_zero")
@@ -271,13 +236,13 @@ class _Tables:
         bodies = []
         for body in range(model.nbody):
             frame = self.frames[body].then(model.body_ipos[body], model.body_iquat[body])
-            turn = _rotation(frame.quat)
-            bodies.append(_Inertial(frame.at, turn @ np.diag(model.body_inertia[body]) @ turn.T))
+            turn = rotation(frame.quat)
+            bodies.append(Inertial(frame.at, turn @ np.diag(model.body_inertia[body]) @ turn.T))
         self.ints["body_link"] = [self._link_number(x.link) for x in self.frames]
         self.ints["body_root"] = model.body_rootid
         self.reals["body_at"] = [x.at for x in self.frames]
         self.reals["body_com"] = [x.com for x in bodies]
-        self.reals["body_inertia"] = [_six(x.inertia) for x in bodies]
+        self.reals["body_inertia"] = [six(x.inertia) for x in bodies]
         self.reals["body_mass"] = model.body_mass
         masses = []
         links = []
@@ -294,10 +259,10 @@ class _Tables:
                 shift = arm @ arm * np.eye(3) - np.outer(arm, arm)
                 inertia += bodies[x].inertia + model.body_mass[x] * shift
             masses.append(mass)
-            links.append(_Inertial(com, inertia))
+            links.append(Inertial(com, inertia))
         self.reals["link_mass"] = masses
         self.reals["link_com"] = [x.com for x in links]
-        self.reals["link_inertia"] = [_six(x.inertia) for x in links]
+        self.reals["link_inertia"] = [six(x.inertia) for x in links]
 
     def _dofs(self) -> None:
         """Makes the tables of degrees of freedom."""
@@ -340,7 +305,7 @@ class _Tables:
                 # The three shifts of a free body are orthogonal: their entries of M are zero.
                 both_shift = kinds[i] == kinds[j] == _SHIFTS_IN_THE_WORLD
                 if j < i and not both_shift:
-                    paired.append(i << 16 | j)
+                    paired.append(records.packed(j, i))
                 j = model.dof_parentid[j]
             # The last degree of freedom of a link has the longest chain, and overwrites the others.
             movers[self.dof_joint[i]] = chain
@@ -359,12 +324,16 @@ class _Tables:
         self.constants["LIMITS"] = int(limited.any()) + int(overlap.any())
         self.constants["LOSSES"] = int(np.any(model.dof_frictionloss))
         self.ints["dof_limited"] = limited
-        limits = [*model.jnt_range[joint].T, model.jnt_margin[joint], model.dof_invweight0]
-        self.reals["dof_limit"] = np.stack(limits, 1)
+        self._records(
+            "dof_limit",
+            range=model.jnt_range[joint],
+            margin=model.jnt_margin[joint],
+            weight=model.dof_invweight0,
+        )
         self.ints["dof_limit_soft"] = self._softs(
             model.jnt_solref[joint], model.jnt_solimp[joint], limited
         )
-        self.reals["dof_loss"] = np.stack([model.dof_frictionloss, model.dof_invweight0], 1)
+        self._records("dof_loss", most=model.dof_frictionloss, weight=model.dof_invweight0)
         self.ints["dof_loss_soft"] = self._softs(
             model.dof_solref, model.dof_solimp, model.dof_frictionloss
         )
@@ -397,8 +366,8 @@ class _Tables:
             # Without a width the impedance is the mean everywhere; 1 keeps the division sound.
             least = most = (least + most) / 2
             width = 1.0
-        key = (stiffness, damping, least, most - least, width, middle, power)
-        return self.soft.setdefault(tuple(float(x) for x in key), len(self.soft))
+        softness = Softness(stiffness, damping, least, most - least, width, middle, power)
+        return self.soft.setdefault(Softness(*map(float, softness)), len(self.soft))
 
     def _actuators(self) -> None:
         """Makes the tables of actuators, in the order of the degrees of freedom that they move."""
@@ -413,15 +382,28 @@ class _Tables:
         # All are affine here: what MuJoCo does not read of the others is zero.
         gain[model.actuator_gaintype == _C.mjtGain.mjGAIN_FIXED, 1:] = 0
         bias[model.actuator_biastype == _C.mjtBias.mjBIAS_NONE] = 0
-        gear = model.actuator_gear[:, :1]
-        rows = np.hstack([gear, controls, gain[:, :1], bias, forces, gain[:, 1:]])
-        self.reals["actuator"] = rows[order]
+        self._records(
+            "actuator",
+            order,
+            gear=model.actuator_gear[:, 0],
+            control_low=controls[:, 0],
+            control_high=controls[:, 1],
+            gain=gain[:, 0],
+            bias=bias[:, 0],
+            bias_by_length=bias[:, 1],
+            bias_by_speed=bias[:, 2],
+            force_low=forces[:, 0],
+            force_high=forces[:, 1],
+            gain_by_length=gain[:, 1],
+            gain_by_speed=gain[:, 2],
+        )
         self.ints["actuator_ctrl"] = model.actuator_ctrladr[order]
         # Those of a degree of freedom are from its entry up to the next one's.
         self.ints["dof_actuator"] = np.searchsorted(dofs[order], np.arange(model.nv + 1))
         joint = self.dof_joint
         limited = model.jnt_actfrclimited[joint, None]
-        self.reals["dof_force"] = np.where(limited, model.jnt_actfrcrange[joint], free)
+        bounds = np.where(limited, model.jnt_actfrcrange[joint], free)
+        self._records("dof_force", low=bounds[:, 0], high=bounds[:, 1])
 
     def _equalities(self) -> None:
         """Makes the tables of equality constraints."""
@@ -473,7 +455,7 @@ class _Tables:
         while any(x >= 0 for x in ancestors):
             for row in range(3):
                 jumps += [
-                    (3 * link + row) | (3 * far + row) << 16
+                    records.packed(3 * link + row, 3 * far + row)
                     for link, far in enumerate(ancestors)
                     if far >= 0
                 ]
@@ -502,7 +484,7 @@ class _Tables:
                 friction = contact_kind.friction[0]
                 weight *= 2 * friction**2 / model.opt.impratio * (1 + friction**2)
             for part in range(supported.NUM_PARTS[supported.geom_kinds(model, pair)]):
-                items.append(numbers[pair.first] | numbers[pair.second] << 12 | part << 24)
+                items.append(records.packed_item(numbers[pair.first], numbers[pair.second], part))
                 item_kinds.append(kind)
                 weights.append(weight)
         self.ints["item"] = items
@@ -534,7 +516,7 @@ class _Tables:
         radii = np.where(plane | box, 0, size[:, 0])
         halves = np.where(types == CAPSULE, size[:, 1], 0)
         reach = np.where(box, np.linalg.norm(size, axis=1), radii + halves)
-        turns = [_rotation(frame.quat) for frame in frames]
+        turns = [rotation(frame.quat) for frame in frames]
         # By the enum of rounds.h: a plane, what is round, a box.
         self.ints["geom_kind"] = np.where(box, 2, ~plane)
         self.ints["geom_body"] = bodies

@@ -12,25 +12,26 @@ struct Bounds {
     for (int n = 0; n < LIMITS; n++) limit_sign[n] = limit_mass[n] = limit_aim[n] = 0;
     const real v = s.qvel[i];
     if (LIMITS && M.dof_limited[i]) {
-      const real q = s.qpos[M.dof_qpos[i]], *limit = M.dof_limit + 4 * i;
-      const real* soft = M.soft + 7 * M.dof_limit_soft[i];
+      const real q = s.qpos[M.dof_qpos[i]];
+      const Limit& limit = M.dof_limit[i];
+      const Softness& soft = M.soft[M.dof_limit_soft[i]];
       UNROLL for (int side = 0; side < 2; side++) {
         const real sign = side ? real(-1) : real(1);
-        const real distance = sign * (q - limit[side]) - limit[2];
+        const real distance = sign * (q - limit.range[side]) - limit.margin;
         if (distance < 0) {
           const int n = LIMITS > 1 ? side : 0;
           const real strength = impedance(soft, distance);
           limit_sign[n] = sign;
-          limit_mass[n] = row_mass(strength, limit[3]);
-          limit_aim[n] = -soft[1] * sign * v - soft[0] * strength * distance;
+          limit_mass[n] = row_mass(strength, limit.weight);
+          limit_aim[n] = -soft.damping * sign * v - soft.stiffness * strength * distance;
         }
       }
     }
     if (LOSSES) {
-      const real* soft = M.soft + 7 * M.dof_loss_soft[i];
-      loss = M.dof_loss[2 * i];
-      loss_mass = loss > 0 ? row_mass(impedance(soft, 0), M.dof_loss[2 * i + 1]) : real(0);
-      loss_aim = -soft[1] * v;
+      const Softness& soft = M.soft[M.dof_loss_soft[i]];
+      loss = M.dof_loss[i].most;
+      loss_mass = loss > 0 ? row_mass(impedance(soft, 0), M.dof_loss[i].weight) : real(0);
+      loss_aim = -soft.damping * v;
     }
   }
   // Adds the gradient at acceleration x, and the stiffness.

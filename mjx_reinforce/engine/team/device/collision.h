@@ -4,7 +4,7 @@
 
 // The contact of an item, if its distance is below the margin.
 DEV Touch touch_of(const Model& M, const State& s, int item, real margin) {
-  const int a = M.item[item] & 0xfff, b = M.item[item] >> 12 & 0xfff, part = M.item[item] >> 24 & 7;
+  const int a = M.item[item].first(), b = M.item[item].second(), part = M.item[item].part();
   Touch c;
   for (int k = 0; k < 3; k++) c.tangent[k] = 0;
   const int below = M.geom_kind[a], above = M.geom_kind[b];
@@ -53,14 +53,15 @@ DEV Contact contact_of(const Model& M, const State& s, int item, const Touch& to
   for (int k = 0; k < 3; k++) c.at[k] = touch.at[k] - s.pose[0].origin(k);
   const int kind = M.item_kind[item];
   const real distance = touch.distance - M.kind_margin[kind];
-  const real *soft = M.soft + 7 * M.kind_soft[kind], strength = impedance(soft, distance);
+  const Softness& soft = M.soft[M.kind_soft[kind]];
+  const real strength = impedance(soft, distance);
   c.item = item;
   c.mass = row_mass(strength, M.item_weight[item]);
   real speed[CD];
   relative(M, s.velocity, c, speed);
   relative(M, s.motion, c, c.gap);
-  for (int k = 0; k < CD; k++) c.gap[k] += soft[1] * speed[k];
-  c.gap[0] += soft[0] * strength * distance;
+  for (int k = 0; k < CD; k++) c.gap[k] += soft.damping * speed[k];
+  c.gap[0] += soft.stiffness * strength * distance;
   return c;
 }
 
@@ -71,7 +72,7 @@ DEV void collide(const Team& t, const Model& M, State& s) {
     const int item = first + lane;
     bool near = false;
     if (item < NI) {
-      const int a = M.item[item] & 0xfff, b = M.item[item] >> 12 & 0xfff;
+      const int a = M.item[item].first(), b = M.item[item].second();
       const Quad p = s.geom_place[a], q = s.geom_place[b];
       const real d[3] = {q.x[0] - p.x[0], q.x[1] - p.x[1], q.x[2] - p.x[2]};
       const real reach = p.x[3] + q.x[3] + M.kind_margin[M.item_kind[item]];

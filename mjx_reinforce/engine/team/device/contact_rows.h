@@ -4,8 +4,8 @@
 // How the second body of a contact moves at the contact, as the first one sees it, in the contact's
 // frame (mj_jacDifPair times a velocity). of: spatial velocities of links.
 DEV void relative(const Model& M, const real (*of)[6], const Contact& c, real* out) {
-  const int item = M.item[c.item];
-  const real *first = of[M.geom_link[item & 0xfff]], *second = of[M.geom_link[item >> 12 & 0xfff]];
+  const Item item = M.item[c.item];
+  const real *first = of[M.geom_link[item.first()]], *second = of[M.geom_link[item.second()]];
   real v[6], point[3];
   for (int k = 0; k < 6; k++) v[k] = second[k] - first[k];
   cross(point, v, c.at);
@@ -14,9 +14,9 @@ DEV void relative(const Model& M, const real (*of)[6], const Contact& c, real* o
 }
 // The entries of the basis of a contact that degree of freedom i has.
 DEV void basis(const Model& M, const State& s, const Contact& c, int i, real* out) {
-  const int item = M.item[c.item];
-  const Mask first = M.link_dofs[M.geom_link[item & 0xfff]];
-  const Mask second = M.link_dofs[M.geom_link[item >> 12 & 0xfff]];
+  const Item item = M.item[c.item];
+  const Mask first = M.link_dofs[M.geom_link[item.first()]];
+  const Mask second = M.link_dofs[M.geom_link[item.second()]];
   const real sign = real(int(second >> i & 1) - int(first >> i & 1));
   const Quad a = s.cdof[i][0], b = s.cdof[i][1];
   real point[3];
@@ -34,7 +34,7 @@ template <class F> DEV void each_edge(const Model& M, const Contact& c, F do_edg
   if (dim == 1) do_edge(real(0), 0, real(1));
   UNROLL for (int k = 1; k < CD; k++) {
     if (k < dim) {
-      const real friction = M.kind_friction[5 * kind + k - 1];
+      const real friction = M.kind_friction[kind].along[k - 1];
       do_edge(friction, k, real(1));
       do_edge(-friction, k, real(-1));
     }

@@ -19,20 +19,21 @@ DEV void actuate(const Team& t, const Model& M, State& s) {
   EACH(i, NV) {
     real force = 0, drag = M.dof_damping[i];
     LOOP for (int a = M.dof_actuator[i]; a < M.dof_actuator[i + 1]; a++) {
-      // gear; control low, high; gain; bias [3]; force low, high; gain by length and speed
-      const real* p = M.actuator + 11 * a;
-      const real gear = p[0], length = gear * s.qpos[M.dof_qpos[i]], speed = gear * s.qvel[i];
-      const real given = clip(s.ctrl[M.actuator_ctrl[a]], p[1], p[2]);
-      const real gain = p[3] + p[9] * length + p[10] * speed;
-      const real pushed = gain * given + p[4] + p[5] * length + p[6] * speed;
-      force += gear * clip(pushed, p[7], p[8]);
-      if (IMPLICIT == 2 && pushed > p[7] && pushed < p[8])
-        drag -= gear * gear * (p[6] + p[10] * given);
+      const Actuator& p = M.actuator[a];
+      const real length = p.gear * s.qpos[M.dof_qpos[i]], speed = p.gear * s.qvel[i];
+      const real control = clip(s.ctrl[M.actuator_ctrl[a]], p.control_low, p.control_high);
+      const real gain = p.gain + p.gain_by_length * length + p.gain_by_speed * speed;
+      const real push =
+          gain * control + p.bias + p.bias_by_length * length + p.bias_by_speed * speed;
+      force += p.gear * clip(push, p.force_low, p.force_high);
+      // A force at its bound does not change with the speed: it damps nothing.
+      if (IMPLICIT == 2 && push > p.force_low && push < p.force_high)
+        drag -= p.gear * p.gear * (p.bias_by_speed + p.gain_by_speed * control);
     }
-    const real low = M.dof_force[2 * i], high = M.dof_force[2 * i + 1];
-    const bool bounded = IMPLICIT == 1 || force <= low || force >= high;
+    const Range range = M.dof_force[i];
+    const bool bounded = IMPLICIT == 1 || force <= range.low || force >= range.high;
     if (IMPLICIT) s.drag[i] = bounded ? M.dof_damping[i] : drag;
-    s.qfrc_actuator[i] = clip(force, low, high);
+    s.qfrc_actuator[i] = clip(force, range.low, range.high);
   }
 }
 
@@ -119,7 +120,7 @@ DEV void forces_and_inertia(const Team& t, const Model& M, State& s) {
   }
   if (NV % 2 && lane == 0) rows[NV * (STRIDE + 1)] = 1;
   EACH(n, NPAIRED) {  // an entry below the diagonal that is not zero
-    const int i = M.paired[n] >> 16, j = M.paired[n] & 0xffff;
+    const int i = M.paired[n].high(), j = M.paired[n].low();
     const Quad a = s.terms[i][0], b = s.cdof[j][0], c = s.terms[i][1], d = s.cdof[j][1];
     rows[i * STRIDE + j] = a.x[0] * b.x[0] + a.x[1] * b.x[1] + a.x[2] * b.x[2] +
                            (a.x[3] * b.x[3] + c.x[0] * d.x[0] + c.x[1] * d.x[1]);

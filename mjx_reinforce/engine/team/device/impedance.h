@@ -1,18 +1,17 @@
 // How stiff constraint rows are, and what the rows add to the cost along a step.
 #pragma once
 
-// The impedance at a distance from where a row begins (MuJoCo's getimpedance). soft: K, B, least,
-// most - least, width, middle, power.
-DEV real impedance(const real* soft, real distance) {
-  const real x = fabs(distance) / soft[4], middle = soft[5], power = soft[6];
-  if (x >= 1) return soft[2] + soft[3];
+// The impedance at a distance from where a row begins (MuJoCo's getimpedance).
+DEV real impedance(const Softness& soft, real distance) {
+  const real x = fabs(distance) / soft.width, middle = soft.middle, power = soft.power;
+  if (x >= 1) return soft.least + soft.rise;
   real y = x;
   if (!ANY_POWER || power == 2)
     y = x <= middle ? x * x / middle : 1 - (1 - x) * (1 - x) / (1 - middle);
   else if (power != 1)
     y = x <= middle ? pow(x, power) / pow(middle, power - 1)
                     : 1 - pow(1 - x, power) / pow(1 - middle, power - 1);
-  return soft[2] + y * soft[3];
+  return soft.least + y * soft.rise;
 }
 // D of a row whose inverse mass is about `weight` (mj_makeImpedance).
 DEV real row_mass(real strength, real weight) {

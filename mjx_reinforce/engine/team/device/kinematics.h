@@ -52,9 +52,9 @@ DEV void place_links(const Team& t, const Model& M, State& s) {
     UNROLL for (int n = 0; n < MOST; n++) {
       const int e = lane + n * W;
       if (n * W < jumps && e < jumps) {
-        const int jump = M.jump[first + e];
-        const Quad far = flat[jump >> 16];
-        const Pose& own = s.pose[(jump & 0xffff) / 3];
+        const Pair jump = M.jump[first + e];
+        const Quad far = flat[jump.high()];
+        const Pose& own = s.pose[jump.low() / 3];
         for (int k = 0; k < 4; k++)
           joined[n].x[k] = far.x[0] * own.row[0].x[k] + far.x[1] * own.row[1].x[k] +
                            far.x[2] * own.row[2].x[k] + (k == 3 ? far.x[3] : real(0));
@@ -63,7 +63,7 @@ DEV void place_links(const Team& t, const Model& M, State& s) {
     t.sync();
     UNROLL for (int n = 0; n < MOST; n++) {
       const int e = lane + n * W;
-      if (n * W < jumps && e < jumps) s.pose[0].row[M.jump[first + e] & 0xffff] = joined[n];
+      if (n * W < jumps && e < jumps) s.pose[0].row[M.jump[first + e].low()] = joined[n];
     }
   }
   t.sync();

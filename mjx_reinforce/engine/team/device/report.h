@@ -21,8 +21,8 @@ DEV void external_forces(const Team& t, const Model& M, State& s) {
   t.sync();
   all_contacts(t, s, [&](const Contact& c) {
     if (c.force[0] == 0) return;
-    const int first = M.geom_body[M.item[c.item] & 0xfff];
-    const int second = M.geom_body[M.item[c.item] >> 12 & 0xfff];
+    const int first = M.geom_body[M.item[c.item].first()];
+    const int second = M.geom_body[M.item[c.item].second()];
     EACH(b, NB) {
       if (b == 0 || (b != first && b != second)) continue;
       real force[3] = {}, torque[3] = {};

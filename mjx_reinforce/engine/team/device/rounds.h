@@ -1,5 +1,4 @@
-// Contacts of spheres, capsules and planes. An item is a part of a pair of geoms that makes one
-// contact at most: an end of a capsule, a corner of a box.
+// Contacts of spheres, capsules and planes.
 #pragma once
 
 enum { PLANE, ROUND, BOX };  // geoms; round are spheres and capsules
