@@ -65,8 +65,9 @@ DEV void motions(const Team& t, const Model& M, State& s) {
   t.sync();
 }
 
-// Leaves M below the diagonal of s.rows (mj_crb), and M x - qfrc_smooth in s.pull (the way back of
-// mj_rne, mj_passive).
+// Leaves M below the diagonal of s.rows (mj_crb), and M x - qfrc_smooth in s.imbalance (the way
+// back of mj_rne, mj_passive), where x is qacc_warmstart: the force that x takes is found with that
+// of qvel, without a product of M.
 DEV void forces_and_inertia(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
   real(*whole)[20] = reinterpret_cast<real(*)[20]>(&s.subtree[0][0].x[0]);
@@ -81,6 +82,8 @@ DEV void forces_and_inertia(const Team& t, const Model& M, State& s) {
     for (int k = 0; k < 6; k++) whole[l][10 + k] = force[k] + a[k];
   }
   t.sync();
+  // From the leaves to the root: each link's inertia and force become those of its subtree. A lane
+  // has one of their 16 numbers, and the tree is written out.
   EACH(k, 16) {
     real sum[NL];
     UNROLL for (int l = 0; l < NL; l++) sum[l] = whole[l][k];
@@ -90,6 +93,7 @@ DEV void forces_and_inertia(const Team& t, const Model& M, State& s) {
       if (has_children(l)) whole[l][k] = sum[l];
   }
   t.sync();
+  // The diagonal waits in registers: s.rows lies where the subtrees are, which are still read.
   real diagonal[(NV + W - 1) / W];
   UNROLL for (int n = 0; n < (NV + W - 1) / W; n++) {
     const int i = lane + n * W;
@@ -106,9 +110,10 @@ DEV void forces_and_inertia(const Team& t, const Model& M, State& s) {
     s.terms[i][1] = {f[4], f[5], 0, 0};
     const real armature = M.dof_armature[i];
     diagonal[n] = dot6(f, moves) + armature;
-    real pull = dot6(force, moves) + armature * s.qacc_warmstart[i] + M.dof_damping[i] * s.qvel[i];
-    pull += M.dof_stiffness[i] * (s.qpos[M.dof_qpos[i]] - M.dof_spring[i]);
-    s.pull[i] = pull - s.qfrc_actuator[i];
+    real imbalance =
+        dot6(force, moves) + armature * s.qacc_warmstart[i] + M.dof_damping[i] * s.qvel[i];
+    imbalance += M.dof_stiffness[i] * (s.qpos[M.dof_qpos[i]] - M.dof_spring[i]);
+    s.imbalance[i] = imbalance - s.qfrc_actuator[i];
   }
   t.sync();
   EACH(n, SIDE * QUADS) (&s.rows[0][0])[n] = {0, 0, 0, 0};

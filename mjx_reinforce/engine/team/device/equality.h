@@ -24,7 +24,7 @@ DEV void connect_rows(const Team& t, const Model& M, State& s, int n) {
     for (int k = 0; k < 3; k++) s.general[3 * n + k][i / 4].x[i % 4] = sum[k];
   }
   EACH(k, 3) {
-    real wanted = 0;
+    real residual = 0;
     for (int side = 0; side < 2; side++) {
       const int l = link[side];
       if (l == NL) continue;
@@ -37,11 +37,11 @@ DEV void connect_rows(const Team& t, const Model& M, State& s, int n) {
       cross(by_qvel, a, arm[side]);
       cross(by_x, x, arm[side]);
       const real point = by_qvel[k] + a[3 + k] + turned[k] + by_x[k] + x[3 + k];
-      wanted += (side ? -1 : 1) * (point + soft.damping * speed[k]);
+      residual += (side ? -1 : 1) * (point + soft.damping * speed[k]);
     }
     const real strength = impedance(soft, root(dot(apart, apart)));
-    s.general_mass[3 * n + k] = row_mass(strength, M.connect_weight[n]);
-    s.general_gap[3 * n + k] = wanted + soft.stiffness * strength * apart[k];
+    s.general_constraint_mass[3 * n + k] = constraint_mass(strength, M.connect_weight[n]);
+    s.general_residual[3 * n + k] = residual + soft.stiffness * strength * apart[k];
   }
 }
 
@@ -63,8 +63,8 @@ DEV void joint_rows(const Team& t, const Model& M, State& s) {
       s.general[e][second / 4].x[second % 4] = -slope;
     }
     const real strength = impedance(soft, off);
-    s.general_mass[e] = row_mass(strength, M.joined_weight[n]);
-    s.general_gap[e] = moves + soft.stiffness * strength * off;
+    s.general_constraint_mass[e] = constraint_mass(strength, M.joined_weight[n]);
+    s.general_residual[e] = moves + soft.stiffness * strength * off;
   }
 }
 

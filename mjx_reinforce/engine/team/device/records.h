@@ -23,8 +23,8 @@ struct Softness {
   real least, rise;           // the impedance where a row begins, and by how much it grows
   real width, middle, power;  // the way in which it grows (m or rad)
 };
-// What an actuator pushes with: gear * clip(gain * control + bias), where gain and bias are affine in
-// its length and speed.
+// What an actuator pushes with: gear * clip(gain * control + bias), where gain and bias are affine
+// in its length and speed.
 struct Actuator {
   real gear, control_low, control_high;
   real gain;
