@@ -85,13 +85,13 @@ def _make(key: str, folder: Path | None, source: Source, capability: str) -> byt
     """Returns a kernel as it is kept: a line of JSON, then its text."""
 
     def compile(text: str) -> bytes:
+        """Returns PTX of LLVM IR. CUDA C++ stays as it is: ``fill`` compiles it to machine code."""
         language = source.language
         if language == "llvm":
             language = "ptx"
             text = _compile(text, capability)
         else:
-            # NVRTC compiles it where it is launched: with the macros of its facts, not in its text.
-            text = source.text
+            text = source.text  # without the macros of its facts, which stand in the first line
         head = {"language": language, **source.facts._asdict()}
         return f"{json.dumps(head)}\n{text}".encode()
 

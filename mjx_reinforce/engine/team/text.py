@@ -18,6 +18,7 @@ from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive
 from mjx_reinforce.engine.scalar.nodes import Call, Node, Scalar, identity, is_constant, same
 from mjx_reinforce.engine.scalar.passes import liveness
 from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop, Schedule
+from mjx_reinforce.engine.team.formulas import Formulas, Place, sum_terms
 from mjx_reinforce.engine.team.operations import expression, literal, type_of
 
 #: Fewer scalars of one formula are computed one by one.
@@ -50,13 +51,6 @@ _SIMULATES = {
     "physics": ("const bool {}[1] = {{physics({}, M, s, {})}};", " + {} * STAGES"),
     "start": ("const bool {}[1] = {{true}}; start({}, M, s);", " + 1"),
 }
-
-
-class Place(NamedTuple):
-    """An array of scalars in memory, and which of them is meant."""
-
-    array: str
-    entry: int
 
 
 class CText(Backend[str]):
@@ -93,8 +87,7 @@ class CText(Backend[str]):
         self._prepared: set[Node] = set()
         self._arrays: dict[tuple[Call, int], str] = {}
         self._written: dict[Node, Place] = {}
-        self._forms: dict[Any, int] = {}
-        self._form_of: dict[Node, int] = {}
+        self._formulas = Formulas(self._place, lambda node: node in self._written)
         self._count = 0
 
     def line(self, text: str) -> None:
@@ -129,7 +122,7 @@ class CText(Backend[str]):
         self._prepare(scalars)
         # Neighbors of one formula are computed by the lanes together. All are grouped before any is
         # written, as writing one changes what others are computed from.
-        runs = [list(run) for _, run in itertools.groupby(scalars, self._form)]
+        runs = [list(run) for _, run in itertools.groupby(scalars, self._formulas.number)]
         start = 0
         for run in runs:
             if len(run) < _FEWEST:
@@ -138,8 +131,6 @@ class CText(Backend[str]):
             else:
                 self._each(run, f"{array}[{start} + i] = {{}};")
             start += len(run)
-
-    # ------------------------------------------------------------------- what a Backend makes
 
     def constant(self, number: Any) -> str:
         """A literal."""
@@ -249,8 +240,6 @@ class CText(Backend[str]):
         arrays = enumerate(call.outs)
         return [f"{self._arrays[call, n]}[{k}]" for n, out in arrays for k in range(len(out))]
 
-    # -------------------------------------------------------------------- what is written before
-
     def _prepare(self, scalars: Sequence[Scalar]) -> None:
         """Writes the steps, such as a call or a loop, that scalars need and that are not yet."""
         waiting = list(scalars)
@@ -290,7 +279,7 @@ class CText(Backend[str]):
         self._values = outer_values
         self._written = outer_places
         # A form may name an array of the body, which is not there any more.
-        self._form_of.clear()
+        self._formulas.forget()
 
     def _place(self, scalar: Scalar) -> Place | None:
         """Returns where an argument, a result of a call or an entry of an array is, or None."""
@@ -323,7 +312,7 @@ class CText(Backend[str]):
         computed = {x: k for k, x in enumerate(scalars) if isinstance(x, Node) and x.op}
         self._values.update({x: f"{array}[{k}]" for x, k in computed.items()})
         self._written.update({x: Place(array, k) for x, k in computed.items()})
-        self._form_of.clear()  # of what is computed from these, too
+        self._formulas.forget()  # of what is computed from these, too
 
     def _layer(self, call: Call) -> None:
         """Writes a layer of a network, whose units are the lanes'."""
@@ -385,21 +374,11 @@ class CText(Backend[str]):
         array, start, stride = spacing
         return lambda count: f"{array}[{start} + {stride} * {count}]"
 
-    # ------------------------------------------------------------------------- lanes together
-
     def _terms(self, node: Node) -> list[Scalar]:
-        """Returns what a node adds up, in order, where nothing else reads the sums between."""
+        """Returns the terms of a sum that the lanes may share; none of what is no such sum."""
         if node.op is None or node.op.name not in _SUMS or node.dtype.kind not in "bf":
             return []
-        waiting = list(node.args)
-        terms = []
-        while waiting:
-            x = waiting.pop()
-            if isinstance(x, Node) and x.op == node.op and self._uses[x] == 1:
-                waiting += x.args
-            else:
-                terms.append(x)
-        return terms[::-1]  # the stack gave the last first
+        return sum_terms(node, self._uses)
 
     def _sum(
         self, kind: _Sum, dtype: np.dtype, terms: list[Scalar], values: dict[Node, str]
@@ -407,7 +386,7 @@ class CText(Backend[str]):
         """Writes a sum whose terms of one formula the lanes share; returns its name."""
         groups: dict[int, list[Scalar]] = {}
         for x in terms:
-            groups.setdefault(self._form(x), []).append(x)
+            groups.setdefault(self._formulas.number(x), []).append(x)
         name = self.name()
         total = self.name()
         self.line(f"{type_of(dtype)} {name} = {kind.start};")
@@ -494,33 +473,6 @@ class CText(Backend[str]):
             tables.append(f"static const int {name}[] = {{{entries}}};")
             return f"{places[0].array}[{name}[i]]"
         return None
-
-    def _form(self, scalar: Scalar) -> int:
-        """Returns a number for the form of a scalar: its formula, whatever its numbers are."""
-        if is_constant(scalar):
-            return self._number(("constant", scalar.dtype.name))
-        waiting = [scalar]
-        while waiting:
-            node = waiting.pop()
-            # What is in memory is told by its place, whatever it was computed from.
-            args = () if node in self._written else node.args
-            missing = [x for x in args if isinstance(x, Node) and x not in self._form_of]
-            if missing:
-                waiting += [node, *missing]
-            elif node not in self._form_of:
-                self._form_of[node] = self._number(self._facts(node))
-        return self._form_of[scalar]
-
-    def _facts(self, node: Node) -> tuple:
-        """Returns what tells a form from others, those of its operands being numbered."""
-        if place := self._place(node):
-            return ("in", place.array)
-        if node.op is None:
-            return ("itself", node.index)
-        return (node.op, node.dtype.name, *(self._form(x) for x in node.args))
-
-    def _number(self, form: tuple) -> int:
-        return self._forms.setdefault(form, len(self._forms))
 
 
 def _owners(body: Schedule) -> dict[Node, LiveGate | LiveLoop | Call]:
