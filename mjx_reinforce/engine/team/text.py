@@ -361,9 +361,7 @@ class CText(Backend[str]):
             return spaced
         name = self.name()
         entries = ", ".join(self.value(x, values) for x in row)
-        # A static table is in memory, once for all; another one is made of registers each time.
-        qualifier = "static const" if all(map(is_constant, row)) else "const"
-        self.line(f"{qualifier} {type_of(row[0].dtype)} {name}[] = {{{entries}}};")
+        self.line(f"{_qualifier(row)} {type_of(row[0].dtype)} {name}[] = {{{entries}}};")
         return lambda count: f"{name}[{count}]"
 
     def _spaced(self, row: Sequence[Scalar]) -> Callable[[str], str] | None:
@@ -464,7 +462,8 @@ class CText(Backend[str]):
             return spaced("i")
         if is_constant(example):
             numbers = ", ".join(map(literal, column))
-            tables.append(f"static const {type_of(example.dtype)} {name}[] = {{{numbers}}};")
+            kind = f"{_qualifier(column)} {type_of(example.dtype)}"
+            tables.append(f"{kind} {name}[] = {{{numbers}}};")
             return f"{name}[i]"
         # Scalars of one form that are in memory are in one array: the form names it.
         places = [x for x in map(self._place, column) if x]
@@ -473,6 +472,15 @@ class CText(Backend[str]):
             tables.append(f"static const int {name}[] = {{{entries}}};")
             return f"{places[0].array}[{name}[i]]"
         return None
+
+
+def _qualifier(entries: Sequence[Scalar]) -> str:
+    """Returns what a table of scalars is declared as."""
+    # A static table is in memory, once for all; another one is made of registers each time. NVRTC
+    # makes no static table of what a function returns, as ``literal`` has infinity and NaN.
+    if all(is_constant(x) and np.isfinite(x) for x in entries):
+        return "static const"
+    return "const"
 
 
 def _owners(body: Schedule) -> dict[Node, LiveGate | LiveLoop | Call]:

@@ -1,15 +1,19 @@
 """Kernels for teams of lanes, compiled with one lane for this CPU, beside its machine code."""
 
+import re
+
 import gpu_on_cpu
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from players import actor_and_act, only_active, played
 
 from mjx_reinforce import envs, make_vec
-from mjx_reinforce.engine.gpu import nvrtc, ptx
-from mjx_reinforce.engine.play import available, native
+from mjx_reinforce.engine.gpu import nvrtc, ptx, team_kernel
+from mjx_reinforce.engine.play import available, native, program
 from mjx_reinforce.engine.play import teams as team
+from mjx_reinforce.engine.scalar import scalarized
 
 if reason := available.unavailable():
     pytest.skip(reason, allow_module_level=True)
@@ -51,6 +55,17 @@ def test_teams_play_the_same_episodes(teams, name):
         np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
     assert np.abs(got.mask.sum(1) - want.mask.sum(1)).max() <= 3
     np.testing.assert_array_equal(got.simulated, got.mask.sum((1, 2)))
+
+
+def test_a_table_with_infinity_is_not_static():
+    """NVRTC initializes static tables by literals alone, and C++ has none for infinity."""
+    limits = np.array([0.7, np.inf, 100, 100, 100, 100], np.float32)
+    function = scalarized.trace(lambda x: x + limits, jnp.zeros(6))
+    written = scalarized.build(*function, program.BRANCH_COST, program.SCANS)
+    physics = team_kernel.Physics("", far=0, skip=1, lanes=16, shared=0)
+    text = team_kernel.mapping_text(written, physics).text
+    assert "bits<float>" in text
+    assert not re.search(r"static const float .*bits<float>", text)
 
 
 @pytest.mark.slow
