@@ -16,6 +16,7 @@ import scipy.special
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.gpu import ptx, seam
 from mjx_reinforce.engine.gpu.kernel import ENTRY
+from mjx_reinforce.engine.gpu.source import Facts
 from mjx_reinforce.engine.play import available
 
 #: A compiler of C++, if there is one.
@@ -92,13 +93,13 @@ def compiled(text, block=None):
     return machine.load_module(text, lambda: text, (ENTRY,), machine.this_machine(), None)
 
 
-def compiled_team(text):
+def compiled_team(source):
     """Returns the address of a kernel in CUDA C++, compiled with one lane for this CPU."""
     with tempfile.TemporaryDirectory() as folder:
         library = f"{folder}/play.so"
         options = ("-std=c++17", "-O1", "-shared", "-fPIC", "-w", "-DREAL=float", "-x", "c++", "-")
         address = ctypes.cast(_ERFINV, ctypes.c_void_p).value
-        text = re.sub(r"#define W \d+", "#define W 1", text)
+        text = source._replace(facts=source.facts._replace(lanes=1)).for_compiler()
         text = f"#define erfinvf(x) ((float (*)(float)){address}ull)(x)\n{text}"
         done = subprocess.run([COMPILER, *options, "-o", library], input=text, text=True)
         assert done.returncode == 0
@@ -125,13 +126,15 @@ def emulate(monkeypatch, threads=1, block=None):
     def load(source, write, capability, folder):
         assert capability == "9.0"
         assert folder is None or folder.name == "native"
-        text = write()
-        if text.startswith("// teams"):
-            made = ptx.described(source, text, compiled=True)
-            words = made.scratch * made.lanes
-            return made._replace(text=str(compiled_team(text)), scratch=words)
-        code = compiled(text, block)
-        return ptx.Kernel(code.key, str(code.addresses[ENTRY]), 256, 1, 0, compiled=True)
+        written = write()
+        facts = written.facts
+        if written.language == "cuda":
+            # The scratch of a team is that of its one lane.
+            facts = facts._replace(scratch=facts.scratch * facts.lanes)
+            address = compiled_team(written)
+            return ptx.Kernel(source, "cuda", str(address), facts, compiled=True)
+        code = compiled(written.text, block)
+        return ptx.Kernel(code.key, "ptx", str(code.addresses[ENTRY]), Facts(256, 1), compiled=True)
 
     def call(kernel, grid, given, first, results):
         size = 32 * -(-threads // 32)
@@ -139,7 +142,8 @@ def emulate(monkeypatch, threads=1, block=None):
         def run(*given):
             given = [np.array(x, order="C") for x in given]
             made = [np.full(x.shape, 0 if first else 77, x.dtype) for x in results]
-            scratch = [np.full(kernel.scratch * size, np.nan, np.float32)] * bool(kernel.scratch)
+            words = kernel.facts.scratch * size
+            scratch = [np.full(words, np.nan, np.float32)] * bool(words)
             run_threads(int(kernel.text), threads, [*given, *made * bool(first), *made, *scratch])
             return made
 

@@ -24,6 +24,7 @@ from mjx_reinforce.engine import cache, objects
 from mjx_reinforce.engine.cpu import machine, seam
 from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.gpu import seam as gpu
+from mjx_reinforce.engine.gpu.source import Facts
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup import compile_times, ready
 
@@ -127,7 +128,7 @@ def test_programs_depend_on_what_jax_is_told(monkeypatch):
 
 
 def test_a_program_that_launches_a_gpus_kernel_is_kept(monkeypatch):
-    kernel = ptx.Kernel("0" * 64, "", 1, 1, 0, compiled=True)
+    kernel = ptx.Kernel("0" * 64, "ptx", "", Facts(threads=1, blocks=1), compiled=True)
     monkeypatch.setattr(ptx, "_LOADED", {kernel.key: kernel})
     monkeypatch.setattr(gpu, "_handler", lambda kernel: gpu._target(kernel.key))
     monkeypatch.setattr(gpu, "_assemblers", lambda: ((), None))

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_reinforce.engine.episode import NOT_PLAYED
+from mjx_reinforce.engine.gpu.source import Facts, Source
 from mjx_reinforce.engine.llvm.emit import LLVM, Input, Value
 from mjx_reinforce.engine.llvm.text import Text
 from mjx_reinforce.engine.scalar import scalarized
@@ -33,14 +34,15 @@ CONTROLS = ("sizes", "limits", "keys")
 RESULTS = ("observation", "action", "reward", "length", "broken", "simulated", "next")
 #: The arguments of a step behind the actor and the state: keys, t, deterministic.
 _NUM_OTHERS = 3
-#: A block's threads, and how many blocks a multiprocessor holds at once, for programs that fit into
-#: its instruction caches and for longer ones. A thread has 128 registers, in a longer program 255.
-_SHORT_BLOCKS, _LONG_BLOCKS = (32, 16), (256, 1)
+#: For programs that fit into a multiprocessor's instruction caches: a thread has 128 registers.
+_SHORT = Facts(threads=32, blocks=16)
+#: For longer ones: a thread has 255 registers.
+_LONG = Facts(threads=256, blocks=1)
 #: XLA's buffers begin at multiples of more bytes. A thread loads as many at once.
 _BUFFER_ALIGN = 16
 #: Denormals are zero, as in machine code for CPUs.
 _ATTRIBUTES = """attributes #0 = {{ "denormal-fp-math-f32"="preserve-sign"
-  "nvvm.maxntid"="{}" "nvvm.minctasm"="{}" }}
+  "nvvm.maxntid"="{facts.threads}" "nvvm.minctasm"="{facts.blocks}" }}
 """
 
 
@@ -64,9 +66,11 @@ _SOME = (
 
 def some_of_block(text: Text, flag: str) -> str:
     """Writes a meeting of all threads of a block; returns an i1: whether one has the flag set."""
-    number = text.let(f"zext i1 {flag} to i32")
-    found = text.let(f'call i32 asm sideeffect "{_SOME}", "=r,r"(i32 {number}) convergent')
-    return text.let(f"icmp ne i32 {found}, 0")
+    flag_word = text.let(f"zext i1 {flag} to i32")
+    # "convergent": else LLVM may copy the barrier into the sides of a branch, where threads of one
+    # block would wait at different barriers.
+    any_word = text.let(f'call i32 asm sideeffect "{_SOME}", "=r,r"(i32 {flag_word}) convergent')
+    return text.let(f"icmp ne i32 {any_word}, 0")
 
 
 def _is_long(body: Schedule) -> bool:
@@ -103,26 +107,30 @@ class Lockstep(LLVM):
         """Writes the branch of threads that only wait for others in a loop."""
         if not self._together or active is None:
             return None
-        text, before = self._text, self._text.block
+        text = self._text
+        before = text.block
         work, after = text.label(), text.label()
         text.line(f"br i1 {active}, label %{work}, label %{after}")
         text.start(work)
-        self._together = False  # until the loop's end
+        # Until the loop's end: only some threads are in the branch, and a barrier in it would wait
+        # for the others forever.
+        self._together = False
         return before, after
 
     @contextlib.contextmanager
     def _going_through(self, body: Schedule) -> Iterator[None]:
+        """Lets all threads enter a body at once if it is long, and is not within a short one."""
         before = self._together
         self._together = before and _is_long(body)
         yield
         self._together = before
 
 
-def entry_text(text: Text, parameters: Sequence[str], written: scalarized.Scalarized) -> str:
+def entry_source(text: Text, parameters: Sequence[str], written: scalarized.Scalarized) -> Source:
     """Returns the kernel of a body, with the bounds of its threads."""
-    blocks = _LONG_BLOCKS if _is_long(written.schedule) else _SHORT_BLOCKS
+    facts = _LONG if _is_long(written.schedule) else _SHORT
     kernel = text.function(f"ptx_kernel void @{ENTRY}({', '.join(parameters)}) #0")
-    return kernel + _ATTRIBUTES.format(*blocks) + LOOP_FACTS
+    return Source("llvm", kernel + _ATTRIBUTES.format(facts=facts) + LOOP_FACTS, facts)
 
 
 class _Leaf(NamedTuple):
@@ -133,7 +141,7 @@ class _Leaf(NamedTuple):
     size: int
 
 
-def kernel_text(step: scalarized.Scalarized, num_actor: int) -> str:
+def kernel_text(step: scalarized.Scalarized, num_actor: int) -> Source:
     """Returns the LLVM IR of ``@play``, without a target.
 
     Its arguments are pointers to: sizes [3] int32 (seeds S, episodes N, steps T), limits [S, N]
@@ -156,24 +164,33 @@ class _Kernel:
     """Writes ``@play``."""
 
     def __init__(self, step: scalarized.Scalarized, num_actor: int):
-        self.text, self.step = Text(1), step
+        """Reserves a thread's memory; see ``kernel_text``."""
+        self.text = Text(1)
+        self.step = step
         avals = [(np.dtype(x.dtype), num_entries(x)) for x in step.in_avals]
-        actor, own = avals[:num_actor], avals[num_actor:]
-        state = own[: len(own) - _NUM_OTHERS]
-        self.given = {  # no argument is empty
-            kind: [f"%{kind}{k}" for k, (_, count) in enumerate(leaves) if count]
+        actor = avals[:num_actor]
+        carried = avals[num_actor:]
+        state = carried[: len(carried) - _NUM_OTHERS]
+        # XLA passes no empty array: such a leaf has no parameter, and nothing reads it.
+        self.parameters = {
+            kind: [f"%{kind}{k}" for k, (_, size) in enumerate(leaves) if size]
             for kind, leaves in (("actor", actor), ("state", state))
         }
-        self.shared = [
-            _Leaf(f"%actor{k}" if leaf[1] else "null", *leaf) for k, leaf in enumerate(actor)
+        self.actor = [
+            _Leaf(f"%actor{k}" if size else "null", dtype, size)
+            for k, (dtype, size) in enumerate(actor)
         ]
-        self.own = [_Leaf(self.text.reserve(*leaf), *leaf) for leaf in own]
-        self.state, (self.keys, self.at, self.mode) = self.own[: len(state)], self.own[len(state) :]
+        # A thread keeps these from one step to the next, in its local memory.
+        self.carried = [
+            _Leaf(self.text.reserve(dtype, size), dtype, size) for dtype, size in carried
+        ]
+        self.state = self.carried[: len(state)]
+        self.keys, self.at, self.mode = self.carried[len(state) :]
         self.row, self.limit, self.asks, self.waited, self.running = (
             self.text.reserve(_INT, 1) for _ in range(5)
         )
 
-    def write(self) -> str:
+    def write(self) -> Source:
         """Returns the kernel."""
         text = self.text
         self.seeds, self.episodes, self.horizon = (
@@ -182,13 +199,16 @@ class _Kernel:
         items = text.let(f"mul i32 {self.seeds}, {self.episodes}")
         text.store("0", self.waited, _INT)
         text.store("1", self.asks, _INT)
-        self._begin("0", "0", "0", "0")  # a thread without an episode has the values of one
+        # A thread without an episode goes through the same steps as others of its block: it has the
+        # values of the first episode, so that it computes sound numbers that nothing keeps.
+        self._begin("0", "0", "0", "0")
         head, body, end = text.label(), text.label(), text.label()
         text.line(f"br label %{head}")
         text.start(head)
         idle = text.let(f"icmp eq i32 {text.load(self.running, _INT)}, 0")
         with text.when(idle):
             self._fetch(items)
+        # The block plays on while one of its threads has an episode: all meet in long loops.
         running = text.let(f"icmp ne i32 {text.load(self.running, _INT)}, 0")
         some = some_of_block(text, running)
         text.line(f"br i1 {some}, label %{body}, label %{end}")
@@ -202,12 +222,13 @@ class _Kernel:
         with text.when(played):
             self._count_steps()
         text.line("ret void")
-        pointers = [*(f"%{name}" for name in CONTROLS), *self.given["actor"], *self.given["state"]]
-        unread = [f"%zero.{name}" for name in RESULTS]
-        written = [f"%{name}" for name in RESULTS]
-        parameters = [f"ptr noalias readonly {x}" for x in pointers]
-        parameters += [f"ptr {x}" for x in [*unread, *written]]
-        return entry_text(text, parameters, self.step)
+        leaves = self.parameters["actor"] + self.parameters["state"]
+        parameters = [f"ptr noalias readonly %{name}" for name in CONTROLS]
+        parameters += [f"ptr noalias readonly {leaf}" for leaf in leaves]
+        # XLA passes the zeros that the results are written over as arguments, too.
+        parameters += [f"ptr %zero.{name}" for name in RESULTS]
+        parameters += [f"ptr %{name}" for name in RESULTS]
+        return entry_source(text, parameters, self.step)
 
     def _fetch(self, items: str) -> None:
         """Writes how a thread takes the next episode that is played, if there is one."""
@@ -217,9 +238,9 @@ class _Kernel:
         text.start(head)
         # A thread that has found no more does not ask again.
         asks = text.let(f"icmp ne i32 {text.load(self.asks, _INT)}, 0")
-        asked = text.label()
-        text.line(f"br i1 {asks}, label %{asked}, label %{end}")
-        text.start(asked)
+        ask = text.label()
+        text.line(f"br i1 {asks}, label %{ask}, label %{end}")
+        text.start(ask)
         item = text.let("atomicrmw add ptr %next, i32 1 monotonic")
         some = text.let(f"icmp ult i32 {item}, {items}")
         none = text.label()
@@ -243,27 +264,26 @@ class _Kernel:
         """Writes how a thread begins an episode of so many steps at most."""
         text = self.text
         place = self._wide(item)
-        for leaf, given in zip((x for x in self.state if x.size), self.given["state"], strict=True):
-            _copy(text, given, place, leaf, leaf.size)
+        leaves = [leaf for leaf in self.state if leaf.size]
+        for leaf, parameter in zip(leaves, self.parameters["state"], strict=True):
+            _copy(text, parameter, place, leaf, leaf.size)
         _copy(text, "%keys", place, self.keys, 2)
-        for value, where in (
-            (mode, self.mode.pointer),
-            ("0", self.at.pointer),
-            (item, self.row),
-            (limit, self.limit),
-            (running, self.running),
-        ):
-            text.store(value, where, _INT)
+        text.store(mode, self.mode.pointer, _INT)
+        text.store("0", self.at.pointer, _INT)
+        text.store(item, self.row, _INT)
+        text.store(limit, self.limit, _INT)
+        text.store(running, self.running, _INT)
 
     def _play(self, running: str) -> None:
         """Writes a step of the thread's episode, which counts if it is running, and its end."""
         text = self.text
         seed = text.let(f"udiv i32 {text.load(self.row, _INT)}, {self.episodes}")
-        actor = [self._row(leaf, seed) for leaf in self.shared]
-        leaves = [*actor, *(Input(leaf.pointer, leaf.dtype) for leaf in self.own)]
+        leaves = [self._row(leaf, seed) for leaf in self.actor]
+        leaves += [Input(leaf.pointer, leaf.dtype) for leaf in self.carried]
         emit = Lockstep(text, leaves.__getitem__)
         values = emit.compile(self.step.schedule, self.step.outputs)
         *records, (goes_on,), (broken,) = values[:5]
+        # All threads of the block computed the step; only those with an episode keep it.
         with text.when(running):
             self._keep(records, seed, values[5:])
             self._end(goes_on, broken)
@@ -272,9 +292,10 @@ class _Kernel:
         """Writes what a step leaves: records, and what the next step reads."""
         text = self.text
         self._record(records, seed)
-        for leaf, to in zip(carried, self.own, strict=False):
-            for k, value in enumerate(leaf):
-                text.store(value, text.at(to.pointer, to.dtype, k), to.dtype)
+        # A step returns the state and the keys; t and the mode, the last of ``carried``, stay.
+        for values, leaf in zip(carried, self.carried, strict=False):
+            for k, value in enumerate(values):
+                text.store(value, text.at(leaf.pointer, leaf.dtype, k), leaf.dtype)
 
     def _end(self, goes_on: str, broken: str) -> None:
         """Writes the end of an episode, if it has come."""
@@ -299,11 +320,13 @@ class _Kernel:
     def _record(self, records: list[list[Any]], seed: str) -> None:
         """Writes observation, action and reward."""
         text = self.text
-        row, at = text.load(self.row, _INT), text.load(self.at.pointer, _INT)
+        row = text.load(self.row, _INT)
+        at = text.load(self.at.pointer, _INT)
         episode = self._wide(text.let(f"urem i32 {row}, {self.episodes}"))
         episodes = self._wide(self.episodes)
         before = text.let(f"mul i64 {self._wide(seed)}, {self._wide(self.horizon)}")
         before = text.let(f"add i64 {before}, {self._wide(at)}")
+        # Episodes are the last axis: threads side by side write to places side by side.
         for values, name, aval in zip(records, RESULTS, self.step.out_avals, strict=False):
             first = text.let(f"mul i64 {before}, {len(values)}")
             for k, value in enumerate(values):
@@ -332,7 +355,7 @@ def _copy(text: Text, source: str, row: str, leaf: _Leaf, count: int) -> None:
         text.store(value, text.at(leaf.pointer, leaf.dtype, k), leaf.dtype)
 
 
-def mapping_text(written: scalarized.Scalarized) -> str:
+def mapping_text(written: scalarized.Scalarized) -> Source:
     """Returns the LLVM IR of ``@play``, without a target.
 
     Its arguments are pointers to: sizes [2] int32 (examples N, threads in all), the leaves [N, ...]
@@ -343,42 +366,47 @@ def mapping_text(written: scalarized.Scalarized) -> str:
       written: the function.
     """
     text = Text(1)
-    sizes = [(np.dtype(x.dtype), num_entries(x)) for x in written.in_avals]
-    own = [_Leaf(text.reserve(*leaf) if leaf[1] else "null", *leaf) for leaf in sizes]
-    given = [k for k, leaf in enumerate(own) if leaf.size]
-    made = [k for k, leaf in enumerate(written.out_avals) if num_entries(leaf)]
-    asked = [f"i32 @llvm.nvvm.read.ptx.sreg.{x}.x()" for x in ("tid", "ctaid", "ntid")]
-    text.declared |= {f"declare {x}" for x in asked}
-    in_block, block, threads = (text.let(f"call {x}") for x in asked)
-    number = text.let(f"add i32 {text.let(f'mul i32 {block}, {threads}')}, {in_block}")
+    leaves = []
+    for aval in written.in_avals:
+        dtype = np.dtype(aval.dtype)
+        size = num_entries(aval)
+        leaves.append(_Leaf(text.reserve(dtype, size) if size else "null", dtype, size))
+    arguments = [k for k, leaf in enumerate(leaves) if leaf.size]
+    results = [k for k, aval in enumerate(written.out_avals) if num_entries(aval)]
+    registers = [f"i32 @llvm.nvvm.read.ptx.sreg.{x}.x()" for x in ("tid", "ctaid", "ntid")]
+    text.declared |= {f"declare {x}" for x in registers}
+    in_block, block, threads = (text.let(f"call {x}") for x in registers)
+    block_start = text.let(f"mul i32 {block}, {threads}")
+    number = text.let(f"add i32 {block_start}, {in_block}")
     total, stride = (text.load(text.at("%sizes", _INT, k), _INT) for k in range(2))
-    before, head, body, end = text.block, text.label(), text.label(), text.label()
+    before = text.block
+    head, body, end = (text.label() for _ in range(3))
     text.line(f"br label %{head}")
     text.start(head)
     item = text.hole()
     running = text.let(f"icmp ult i32 {item.name}, {total}")
     text.line(f"br i1 {some_of_block(text, running)}, label %{body}, label %{end}")
     text.start(body)
-    row = text.let(f"select i1 {running}, i32 {item.name}, i32 0")  # waits with another's numbers
+    # A thread without an example computes the first one beside the others, and keeps nothing of it.
+    row = text.let(f"select i1 {running}, i32 {item.name}, i32 0")
     row = text.let(f"zext i32 {row} to i64")
-    for k in given:
-        _copy(text, f"%given{k}", row, own[k], own[k].size)
-    emit = Lockstep(text, lambda k: Input(own[k].pointer, own[k].dtype))
-    results = emit.compile(written.schedule, written.outputs)
+    for k in arguments:
+        _copy(text, f"%argument{k}", row, leaves[k], leaves[k].size)
+    emit = Lockstep(text, lambda k: Input(leaves[k].pointer, leaves[k].dtype))
+    values = emit.compile(written.schedule, written.outputs)
     with text.when(running):
-        for k in made:
-            leaf = written.out_avals[k]
-            start = text.at(
-                f"%made{k}", leaf.dtype, text.let(f"mul i64 {row}, {num_entries(leaf)}")
-            )
-            for entry, value in enumerate(results[k]):
-                text.store(value, text.at(start, leaf.dtype, entry), leaf.dtype)
+        for k in results:
+            aval = written.out_avals[k]
+            start = text.let(f"mul i64 {row}, {num_entries(aval)}")
+            pointer = text.at(f"%result{k}", aval.dtype, start)
+            for entry, value in enumerate(values[k]):
+                text.store(value, text.at(pointer, aval.dtype, entry), aval.dtype)
     following = text.let(f"add i32 {item.name}, {stride}")
     text.fill(item, f"phi i32 [{number}, %{before}], [{following}, %{text.block}]")
     text.line(f"br label %{head}")
     text.start(end)
     text.line("ret void")
     parameters = ["ptr noalias readonly %sizes"]
-    parameters += [f"ptr noalias readonly %given{k}" for k in given]
-    parameters += [f"ptr %made{k}" for k in made]
-    return entry_text(text, parameters, written)
+    parameters += [f"ptr noalias readonly %argument{k}" for k in arguments]
+    parameters += [f"ptr %result{k}" for k in results]
+    return entry_source(text, parameters, written)

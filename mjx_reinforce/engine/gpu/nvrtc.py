@@ -6,6 +6,7 @@ import importlib.util
 import os
 from pathlib import Path
 
+#: Where pip puts it, in the folder nvidia: for CUDA 13, and for CUDA 12.
 _NAMES = ("cu*/lib/libnvrtc.so.??", "cuda_nvrtc/lib/libnvrtc.so.??")
 #: Division and roots as XLA's GPU programs have them, and denormals are zero.
 _OPTIONS = ("--std=c++17", "-default-device", "-ftz=true", "-prec-div=false", "-prec-sqrt=false")
@@ -16,10 +17,12 @@ def library() -> ctypes.CDLL | None:
     """Returns NVRTC: that of pip, or CUDA's; None if there is none."""
     nvidia = importlib.util.find_spec("nvidia")
     folders = map(Path, (nvidia and nvidia.submodule_search_locations) or [])
-    found = [path for folder in folders for name in _NAMES for path in sorted(folder.glob(name))]
-    for file in (*found, Path(os.environ.get("CUDA_HOME", "/usr/local/cuda"), "lib64/libnvrtc.so")):
+    paths = [path for folder in folders for name in _NAMES for path in sorted(folder.glob(name))]
+    paths.append(Path(os.environ.get("CUDA_HOME", "/usr/local/cuda"), "lib64/libnvrtc.so"))
+    for path in paths:
+        # A library may be there and still not load, as one of another machine's architecture.
         try:
-            return ctypes.CDLL(str(file))
+            return ctypes.CDLL(str(path))
         except OSError:
             continue
     return None
@@ -29,7 +32,8 @@ def version() -> str:
     """Returns the version of NVRTC, or why there is none."""
     if (nvrtc := library()) is None:
         return "NVRTC is not found; pip install nvidia-cuda-nvrtc-cu12"
-    major, minor = ctypes.c_int(), ctypes.c_int()
+    major = ctypes.c_int()
+    minor = ctypes.c_int()
     nvrtc.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
     return f"NVRTC {major.value}.{minor.value}"
 
@@ -40,26 +44,29 @@ def compile(capability: str, text: str) -> tuple[str, bytes]:
     Raises:
       RuntimeError: the text is no CUDA C++, or NVRTC does not know such GPUs.
     """
-    nvrtc, program = library(), ctypes.c_void_p()
+    nvrtc = library()
     if nvrtc is None:
         raise RuntimeError(version())
-    nothing = 0, None, None
-    nvrtc.nvrtcCreateProgram(ctypes.byref(program), text.encode(), b"play.cu", *nothing)
+    program = ctypes.c_void_p()
+    no_headers = 0, None, None
+    nvrtc.nvrtcCreateProgram(ctypes.byref(program), text.encode(), b"play.cu", *no_headers)
+    # For one architecture by its number (sm_90, not compute_90) NVRTC makes machine code: no PTX
+    # that the driver would have to assemble at the first launch.
     options = [f"--gpu-architecture=sm_{capability.replace('.', '')}", *_OPTIONS]
-    given = (ctypes.c_char_p * len(options))(*(x.encode() for x in options))
-    status = nvrtc.nvrtcCompileProgram(program, len(options), given)
+    option_array = (ctypes.c_char_p * len(options))(*(x.encode() for x in options))
+    status = nvrtc.nvrtcCompileProgram(program, len(options), option_array)
     log = _read(nvrtc, program, "ProgramLog").decode(errors="replace").rstrip("\0")
     if status:
         raise RuntimeError(f"NVRTC returned {status}: {' '.join(log.split())[:2000]}")
-    made = _read(nvrtc, program, "CUBIN")
+    cubin = _read(nvrtc, program, "CUBIN")
     nvrtc.nvrtcDestroyProgram(ctypes.byref(program))
-    return log, made
+    return log, cubin
 
 
-def _read(nvrtc: ctypes.CDLL, program: ctypes.c_void_p, what: str) -> bytes:
-    """Returns what NVRTC has of a program."""
+def _read(nvrtc: ctypes.CDLL, program: ctypes.c_void_p, product: str) -> bytes:
+    """Returns what NVRTC made of a program, such as "CUBIN": its bytes."""
     size = ctypes.c_size_t()
-    getattr(nvrtc, f"nvrtcGet{what}Size")(program, ctypes.byref(size))
-    room = ctypes.create_string_buffer(size.value)
-    getattr(nvrtc, f"nvrtcGet{what}")(program, room)
-    return room.raw
+    getattr(nvrtc, f"nvrtcGet{product}Size")(program, ctypes.byref(size))
+    buffer = ctypes.create_string_buffer(size.value)
+    getattr(nvrtc, f"nvrtcGet{product}")(program, buffer)
+    return buffer.raw

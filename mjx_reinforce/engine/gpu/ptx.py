@@ -9,6 +9,7 @@ import ctypes
 import functools
 import hashlib
 import importlib.util
+import json
 import os
 import re
 import shutil
@@ -23,15 +24,13 @@ from mjx_reinforce.engine import objects, scalar
 from mjx_reinforce.engine.cpu import handler, machine
 from mjx_reinforce.engine.gpu import nvrtc
 from mjx_reinforce.engine.gpu.kernel import ENTRY
+from mjx_reinforce.engine.gpu.source import Facts, Language, Source
 
 #: LLVM's name of NVIDIA's GPUs.
 TRIPLE = "nvptx64-nvidia-cuda"
-#: What finds a kernel's threads and blocks.
-_BOUNDS = r"\.maxntid (\d+)", r"\.minnctapersm (\d+)"
+_VERSION = r"\.version (\d+\.\d+)"
 #: What GPUs of compute capability 7.0 need. For one that it does not know, LLVM writes 3.2.
-_VERSION, _LEAST_VERSION = r"\.version (\d+\.\d+)", 6.0
-#: The first line of CUDA C++: lanes of a team, threads and shared memory of a block, scratch.
-_TEAM = "// teams of {}, {} threads, {} bytes, scratch = {}\n"
+_LEAST_VERSION = 6.0
 _LOADED: dict[str, "Kernel"] = {}
 _LOCK = threading.Lock()
 
@@ -40,33 +39,32 @@ class Kernel(NamedTuple):
     """A kernel as PTX, or as CUDA C++ for teams of lanes.
 
     key: a name for all that it depends on
+    language: "ptx" or "cuda"
     text: its entry is "play"
-    threads: of a block, at most
-    blocks: on a multiprocessor; its registers are as many as that leaves each thread
-    scratch: 4-byte words of a buffer that each thread needs
+    facts: how it is launched
     compiled: whether it was compiled now, and not read from disk
-    lanes: threads that play an episode together
-    shared: bytes of shared memory of a block
     """
 
     key: str
+    language: Language
     text: str
-    threads: int
-    blocks: int
-    scratch: int
+    facts: Facts
     compiled: bool
-    lanes: int = 1
-    shared: int = 0
+
+    @property
+    def source(self) -> Source:
+        """What its machine code is made of."""
+        return Source(self.language, self.text, self.facts)
 
 
 def load_kernel(
-    source: str, write: Callable[[], str], capability: str, folder: Path | None
+    source: str, write: Callable[[], Source], capability: str, folder: Path | None
 ) -> Kernel:
     """Returns a kernel, compiled unless memory or disk has it.
 
     Args:
       source: all that the text of the kernel depends on, or a hash of it.
-      write: returns LLVM IR, such as ``kernel.kernel_text``, or CUDA C++ as ``team_text``.
+      write: returns LLVM IR, such as ``kernel.kernel_text``, or CUDA C++, which is compiled later.
       capability: the compute capability of the GPU, such as "9.0".
       folder: where kernels are kept; None keeps none.
 
@@ -75,21 +73,29 @@ def load_kernel(
       RuntimeError: the text is no LLVM IR, or this LLVM has no code for such a GPU.
     """
     key = objects.key_of(capability, source)
-
-    def compile(text: str) -> bytes:
-        return (text if text.startswith(_TEAM[:8]) else _compile(text, capability)).encode()
-
     with _LOCK:
         if key not in _LOADED:
-            found = objects.kept(key, folder)
-            made = found or objects.make(key, folder, write(), compile)
-            _LOADED[key] = described(key, made.decode(), compiled=not found)
+            cached = objects.kept(key, folder)
+            content = cached or _make(key, folder, write(), capability)
+            _LOADED[key] = described(key, content, compiled=not cached)
         return _LOADED[key]
 
 
-def team_text(text: str, lanes: int, threads: int, shared: int, scratch: int) -> str:
-    """Returns CUDA C++ with what ``Kernel`` says of it."""
-    return _TEAM.format(lanes, threads, shared, scratch) + text
+def _make(key: str, folder: Path | None, source: Source, capability: str) -> bytes:
+    """Returns a kernel as it is kept: a line of JSON, then its text."""
+
+    def compile(text: str) -> bytes:
+        """Returns PTX of LLVM IR. CUDA C++ stays as it is: ``fill`` compiles it to machine code."""
+        language = source.language
+        if language == "llvm":
+            language = "ptx"
+            text = _compile(text, capability)
+        else:
+            text = source.text  # without the macros of its facts, which stand in the first line
+        head = {"language": language, **source.facts._asdict()}
+        return f"{json.dumps(head)}\n{text}".encode()
+
+    return objects.make(key, folder, source.for_compiler(), compile)
 
 
 def in_memory() -> list[str]:
@@ -99,17 +105,16 @@ def in_memory() -> list[str]:
 
 def kept(key: str, folder: Path) -> Kernel | None:
     """Returns a kernel by its key; None if it is not on disk."""
-    found = objects.read_object(folder, key)
-    return described(key, found.decode(), compiled=False) if found else None
+    content = objects.read_object(folder, key)
+    return described(key, content, compiled=False) if content else None
 
 
-def described(key: str, text: str, *, compiled: bool) -> Kernel:
-    """Returns the kernel of a text, which says how it is launched."""
-    if found := re.match(_TEAM.format(*[r"(\d+)"] * 4), text):
-        lanes, threads, shared, words = map(int, found.groups())
-        return Kernel(key, text, threads, 1, words, compiled, lanes, shared)
-    threads, blocks = (int(re.findall(x, text)[0]) for x in _BOUNDS)
-    return Kernel(key, text, threads, blocks, 0, compiled)
+def described(key: str, content: bytes, *, compiled: bool) -> Kernel:
+    """Returns a kernel from what is kept of it, whose first line says what it is."""
+    line, _, text = content.decode().partition("\n")
+    head = json.loads(line)
+    language = head.pop("language")
+    return Kernel(key, language, text, Facts(**head), compiled)
 
 
 def _compile(text: str, capability: str) -> str:
@@ -117,8 +122,9 @@ def _compile(text: str, capability: str) -> str:
     import llvmlite
     import llvmlite.binding as llvm
 
-    if called := re.findall(r"^declare double @(\w+)\(", text, re.M):
-        raise scalar.UnsupportedPrimitive(f"{', '.join(called)}: no kernel for GPUs computes it")
+    # A GPU has no C library. What LLVM has itself is declared as @llvm..., which \w does not match.
+    if functions := re.findall(r"^declare double @(\w+)\(", text, re.M):
+        raise scalar.UnsupportedPrimitive(f"{', '.join(functions)}: no kernel for GPUs computes it")
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
     target = llvm.Target.from_triple(TRIPLE).create_target_machine(
@@ -138,8 +144,10 @@ def _compile(text: str, capability: str) -> str:
 def _with_xla_divisions(text: str) -> str:
     """Returns PTX with division as XLA's GPU programs have it, within 2 units in the last place."""
     replaced = text.replace("div.rn.ftz.f32", "div.full.ftz.f32")
-    left = re.search(r"\bdiv\.rn\S*\.f32", replaced)
-    assert left is None, f"LLVM has another name for a division: {left}"
+    # One that is rounded correctly is a subroutine of many instructions: it would go unnoticed, and
+    # slow every kernel, if a later LLVM spelled divisions otherwise.
+    exact_division = re.search(r"\bdiv\.rn\S*\.f32", replaced)
+    assert exact_division is None, f"LLVM has another name for a division: {exact_division}"
     return replaced
 
 
@@ -166,10 +174,11 @@ def launcher(key: str) -> tuple[int, int]:
 
     The slot is a pointer to ``cuLaunchKernel`` and the kernel; a launch waits while it is null.
     """
+    # The key is in the text so that each kernel has a module, and with it a slot, of its own.
     text = f"; launches {key}\n{handler.with_entry(_TEXT, {})}"
-    names, target = ("handler", "slot"), machine.this_machine()
-    found = machine.load_module(text, lambda: text, names, target, None).addresses
-    return found["handler"], found["slot"]
+    names = ("handler", "slot")
+    code = machine.load_module(text, lambda: text, names, machine.this_machine(), None)
+    return code.addresses["handler"], code.addresses["slot"]
 
 
 def fill(slot: int, kernel: Kernel, assemblers: Sequence[Assembler], folder: Path | None) -> None:
@@ -185,27 +194,29 @@ def fill(slot: int, kernel: Kernel, assemblers: Sequence[Assembler], folder: Pat
     ready = ctypes.c_void_p()
     for assembler in assemblers:
         try:
-            ready = _in_memory(cuda, _machine_code(kernel, assembler, folder), kernel.shared)
+            image = _machine_code(kernel, assembler, folder)
+            ready = _in_memory(cuda, image, kernel.facts.shared)
             break
         except Exception as error:  # whatever an assembler or a driver raises
             objects.describe(kernel.key, f"not by {assembler.name}: {error}")
     launch = ctypes.cast(cuda.cuLaunchKernel, ctypes.c_void_p)
-    _FILLED.append((ctypes.c_void_p * 3)(launch, ready, kernel.shared))
+    _FILLED.append((ctypes.c_void_p * 3)(launch, ready, kernel.facts.shared))
+    # Last of all, as a launch in another thread reads all three once the slot is not null.
     ctypes.c_void_p.from_address(slot).value = ctypes.addressof(_FILLED[-1])
 
 
 def _machine_code(kernel: Kernel, assembler: Assembler, folder: Path | None) -> bytes:
     """Returns the machine code of a kernel, assembled unless the disk has it."""
     key = hashlib.sha256(f"2 {kernel.key} {assembler.name}".encode()).hexdigest()
-    if found := objects.kept(key, folder):
-        return found
-    began = time.perf_counter()
-    log, made = assembler.assemble(kernel.text)
-    seconds = time.perf_counter() - began
+    if cached := objects.kept(key, folder):
+        return cached
+    start = time.perf_counter()
+    log, machine_code = assembler.assemble(kernel.source.for_compiler())
+    seconds = time.perf_counter() - start
     objects.describe(kernel.key, f"{assembler.name} took {seconds:.2f} s: {log}")
     if folder:
-        objects.write_object(folder, key, made)
-    return made
+        objects.write_object(folder, key, machine_code)
+    return machine_code
 
 
 def _in_memory(cuda: ctypes.CDLL, image: bytes, shared: int) -> ctypes.c_void_p:
@@ -216,12 +227,15 @@ def _in_memory(cuda: ctypes.CDLL, image: bytes, shared: int) -> ctypes.c_void_p:
       image: machine code, or PTX.
       shared: bytes of shared memory that a block is launched with.
     """
-    library, kernel = ctypes.c_void_p(), ctypes.c_void_p()
-    nothing = None, None, 0
-    if status := cuda.cuLibraryLoadData(ctypes.byref(library), image, *nothing, *nothing):
+    library = ctypes.c_void_p()
+    kernel = ctypes.c_void_p()
+    # Neither options of the driver's compiler nor of the library: names, values, and how many.
+    no_options = None, None, 0
+    if status := cuda.cuLibraryLoadData(ctypes.byref(library), image, *no_options, *no_options):
         raise RuntimeError(f"cuLibraryLoadData returned {status}")
     if status := cuda.cuLibraryGetKernel(ctypes.byref(kernel), library, ENTRY.encode()):
         raise RuntimeError(f"cuLibraryGetKernel returned {status}")
+    # Without the attribute, a launch that asks for more than 48 KiB of shared memory is an error.
     if shared:
         count = ctypes.c_int()
         cuda.cuDeviceGetCount(ctypes.byref(count))
@@ -240,14 +254,17 @@ def assemblers(capability: str) -> tuple[Assembler, ...]:
         ctypes.CDLL("libcuda.so.1")
     except OSError:
         return ()
-    found = []
+    programs = []
     for path in _programs():
         with contextlib.suppress(OSError, subprocess.SubprocessError):
-            said = subprocess.run([path, "--version"], capture_output=True, text=True, check=True)
-            name = f"ptxas, {said.stdout.strip().splitlines()[-1]}"
+            process = subprocess.run(
+                [path, "--version"], capture_output=True, text=True, check=True
+            )
+            name = f"ptxas, {process.stdout.strip().splitlines()[-1]}"
             assemble = functools.partial(_by_program, path, capability)
-            found.append(Assembler(name, assemble))
-    return (*found, Assembler("the driver", lambda text: ("", text.encode() + b"\0")))
+            programs.append(Assembler(name, assemble))
+    # Any driver assembles PTX when it loads it: the last resort.
+    return (*programs, Assembler("the driver", lambda text: ("", text.encode() + b"\0")))
 
 
 def compiler(capability: str) -> Assembler:
@@ -259,17 +276,18 @@ def _programs() -> list[str]:
     """Returns where ptxas is: that of pip, which JAX brings, on PATH, in CUDA's folder."""
     nvidia = importlib.util.find_spec("nvidia")
     folders = map(Path, (nvidia and nvidia.submodule_search_locations) or [])
-    found = [str(path) for folder in folders for path in sorted(folder.glob("cu*/bin/ptxas"))]
+    of_pip = [str(path) for folder in folders for path in sorted(folder.glob("cu*/bin/ptxas"))]
     cuda = f"{os.environ.get('CUDA_HOME', '')}/bin"
-    return [*found, *filter(None, (shutil.which("ptxas"), shutil.which("ptxas", path=cuda)))]
+    of_system = shutil.which("ptxas"), shutil.which("ptxas", path=cuda)
+    return of_pip + [path for path in of_system if path]
 
 
 def _by_program(path: str, capability: str, text: str) -> tuple[str, bytes]:
     """Assembles PTX with ptxas."""
     architecture = f"-arch=sm_{capability.replace('.', '')}"
     command = [path, "-v", architecture, "/dev/stdin", "-o", "/dev/stdout"]
-    done = subprocess.run(command, input=text.encode(), capture_output=True)
-    log = done.stderr.decode(errors="replace")
-    if done.returncode:
-        raise RuntimeError(f"ptxas returned {done.returncode}: {' '.join(log.split())[:300]}")
-    return log, done.stdout
+    process = subprocess.run(command, input=text.encode(), capture_output=True)
+    log = process.stderr.decode(errors="replace")
+    if process.returncode:
+        raise RuntimeError(f"ptxas returned {process.returncode}: {' '.join(log.split())[:300]}")
+    return log, process.stdout

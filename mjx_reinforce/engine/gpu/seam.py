@@ -18,13 +18,12 @@ import numpy as np
 from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.gpu import nvrtc, ptx
 from mjx_reinforce.engine.gpu import team_kernel as team
+from mjx_reinforce.engine.gpu.source import WARP
 
 #: LLVM 22, which llvmlite 0.48 has, is the first that bounds a kernel's threads and blocks.
 _OLDEST = (22,)
 #: What may assemble a kernel, what is preferred first.
 Assemblers = tuple[ptx.Assembler, ...]
-#: Threads of a warp.
-_WARP = 32
 #: XLA's names of the handlers that it knows.
 _HANDLERS: set[str] = set()
 _LOCK = threading.Lock()
@@ -55,8 +54,10 @@ def _assemblers() -> tuple[Assemblers, str | None]:
     capabilities = {getattr(x, "compute_capability", "") for x in jax.local_devices()}
     if len(capabilities) > 1:
         return (), f"its kernels are for GPUs of one kind, not {' and '.join(sorted(capabilities))}"
-    found = ptx.assemblers(compute_capability())
-    return found, None if found else "NVIDIA's driver, libcuda.so.1, is not found"
+    assemblers = ptx.assemblers(compute_capability())
+    if not assemblers:
+        return (), "NVIDIA's driver, libcuda.so.1, is not found"
+    return assemblers, None
 
 
 def targets() -> list[str]:
@@ -71,7 +72,9 @@ def restore(program: bytes) -> bool:
       program: as JAX exports it, or anything else that has the names of handlers in it.
     """
     folder = objects.folder()
-    for key in set(re.findall(rb"mjx_reinforce_gpu_([0-9a-f]{64})", program)):
+    # XLA writes the names of handlers into its programs as they are: no need to parse one.
+    keys = set(re.findall(rb"mjx_reinforce_gpu_([0-9a-f]{64})", program))
+    for key in keys:
         kernel = ptx.kept(key.decode(), folder) if folder else None
         if kernel is None or not _makers(kernel):
             return False
@@ -86,7 +89,9 @@ def _target(key: str) -> str:
 
 def _makers(kernel: ptx.Kernel) -> Assemblers:
     """Returns what makes machine code of a kernel's text, what is preferred first."""
-    return _assemblers()[0] if kernel.lanes == 1 else (ptx.compiler(compute_capability()),)
+    if kernel.language == "cuda":
+        return (ptx.compiler(compute_capability()),)
+    return _assemblers()[0]
 
 
 def _handler(kernel: ptx.Kernel) -> str:
@@ -97,8 +102,9 @@ def _handler(kernel: ptx.Kernel) -> str:
             handler, slot = ptx.launcher(kernel.key)
             address = jax.ffi.pycapsule(ctypes.c_void_p(handler))
             jax.ffi.register_ffi_target(name, address, platform="CUDA")
-            given = (slot, kernel, _makers(kernel), objects.folder())
-            threading.Thread(target=ptx.fill, args=given, daemon=True).start()
+            # A daemon, so that a program that ends early need not wait for NVIDIA's compilers.
+            arguments = (slot, kernel, _makers(kernel), objects.folder())
+            threading.Thread(target=ptx.fill, args=arguments, daemon=True).start()
             _HANDLERS.add(name)
     return name
 
@@ -110,8 +116,8 @@ def compute_capability() -> str:
 
 def kernel_dependencies() -> str:
     """Returns what a program with kernels depends on."""
-    counted = f"{jax.devices()[0].core_count} multiprocessors"
-    return f"compute capability {compute_capability()}, {counted}, {nvrtc.version()}"
+    processors = f"{jax.devices()[0].core_count} multiprocessors"
+    return f"compute capability {compute_capability()}, {processors}, {nvrtc.version()}"
 
 
 def launch(
@@ -143,11 +149,13 @@ def in_one_launch(run: Callable[..., Sequence[jax.Array]]) -> Callable[..., Sequ
 
     @together.def_vmap
     def _(size, mapped, *args):
-        along = [
+        """Joins the mapped axis [size] with the batch axis [B] behind it: one call for all."""
+        stacked = [
             x if is_mapped else jnp.broadcast_to(x, (size, *x.shape))
             for x, is_mapped in zip(args, mapped, strict=True)
         ]
-        results = together(*(x.reshape(-1, *x.shape[2:]) for x in along))
+        results = together(*(x.reshape(-1, *x.shape[2:]) for x in stacked))
+        # ``together`` again, not ``run``: an outer vmap finds the same rule.
         return [x.reshape(size, -1, *x.shape[1:]) for x in results], [True] * len(results)
 
     return together
@@ -156,10 +164,12 @@ def in_one_launch(run: Callable[..., Sequence[jax.Array]]) -> Callable[..., Sequ
 def _launch(
     kernel: ptx.Kernel, record: Sequence[jax.ShapeDtypeStruct], horizon: int, *args: jax.Array
 ) -> Sequence[jax.Array]:
+    """Runs a kernel for seeds, whose axis all arguments and results begin with."""
     seeds, episodes = args[0].shape
+    # Length, broken, simulated and the next item, in the order of ``kernel.RESULTS``.
     counts = (seeds, episodes), (seeds, episodes), (seeds,), (1,)
     zeros = [jnp.zeros((seeds, horizon, math.prod(x.shape), episodes), x.dtype) for x in record]
-    zeros += [jnp.zeros(x, jnp.int32) for x in counts]
+    zeros += [jnp.zeros(shape, jnp.int32) for shape in counts]
     kernel, grid = _sized(kernel, seeds * episodes)
     sizes = jnp.array([seeds, episodes, horizon], jnp.int32)
     return _call(kernel, grid, [sizes, *args], zeros, zeros)[:-1]
@@ -180,8 +190,8 @@ def launch_map(
         examples = len(args[0])
         sized, grid = _sized(kernel, examples)
         sizes = jnp.array([examples, math.prod(grid)], jnp.int32)
-        made = [jax.ShapeDtypeStruct((examples, *x.shape[1:]), x.dtype) for x in results]
-        return _call(sized, grid, [sizes, *args], [], made)
+        stacked = [jax.ShapeDtypeStruct((examples, *x.shape[1:]), x.dtype) for x in results]
+        return _call(sized, grid, [sizes, *args], [], stacked)
 
     return in_one_launch(play)(*args)
 
@@ -189,28 +199,39 @@ def launch_map(
 def _call(
     kernel: ptx.Kernel,
     grid: tuple[int, int],
-    given: Sequence[jax.Array],
-    first: Sequence[jax.Array],
+    arguments: Sequence[jax.Array],
+    initial: Sequence[jax.Array],
     results: Sequence[jax.ShapeDtypeStruct | jax.Array],
 ) -> Sequence[jax.Array]:
-    """Launches so many blocks of so many threads; returns what they make of what was there first.
+    """Launches blocks of threads; returns what they make of the initial values of the results.
 
-    If nothing was, they write all of it. If the kernel has scratch, it begins with any values.
+    Where there are none, the threads write all of the results. If the kernel has scratch, it begins
+    with any values.
+
+    Args:
+      kernel: what is launched.
+      grid: how many blocks of how many threads.
+      arguments: what the kernel reads.
+      initial: values of the results, or none.
+      results: their shapes and dtypes.
     """
-    words = kernel.scratch * math.prod(grid)
-    scratch = [jax.ShapeDtypeStruct((words,), jnp.int32)] if words else []
-    aliases = {len(given) + k: k for k in range(len(first))}
+    scratch = []
+    if words := kernel.facts.scratch * math.prod(grid):
+        scratch.append(jax.ShapeDtypeStruct((words,), jnp.int32))
+    # XLA lets the kernel write over the initial values, rather than copy them.
+    aliases = {len(arguments) + k: k for k in range(len(initial))}
     blocks, threads = map(np.int32, grid)
     target = _handler(kernel)
     call = jax.ffi.ffi_call(target, [*results, *scratch], input_output_aliases=aliases)
-    return call(*given, *first, blocks=blocks, threads=threads)[: len(results)]
+    return call(*arguments, *initial, blocks=blocks, threads=threads)[: len(results)]
 
 
 def _sized(kernel: ptx.Kernel, items: int) -> tuple[ptx.Kernel, tuple[int, int]]:
     """Returns the kernel, and how many blocks of how many threads, that play so many items."""
-    if kernel.lanes > 1:
+    if kernel.facts.lanes > 1:
         kernel = team.for_items(kernel, items, jax.devices()[0].core_count, compute_capability())
-    return kernel, _grid(items * kernel.lanes, kernel.threads, kernel.blocks)
+    facts = kernel.facts
+    return kernel, _grid(items * facts.lanes, facts.threads, facts.blocks)
 
 
 def _grid(items: int, most: int, blocks: int) -> tuple[int, int]:
@@ -219,5 +240,6 @@ def _grid(items: int, most: int, blocks: int) -> tuple[int, int]:
     They are spread over all multiprocessors, each of which has so many blocks at most.
     """
     processors = jax.devices()[0].core_count
-    threads = min(_WARP * -(-items // (_WARP * processors)), most)
+    # A block is whole warps. Few episodes get small blocks, so that each multiprocessor has some.
+    threads = min(WARP * -(-items // (WARP * processors)), most)
     return min(-(-items // threads), blocks * processors), threads

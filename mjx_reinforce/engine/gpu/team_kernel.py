@@ -13,14 +13,26 @@ import numpy as np
 from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.gpu.kernel import CONTROLS, RESULTS
+from mjx_reinforce.engine.gpu.source import WARP, Facts, Source
 from mjx_reinforce.engine.scalar import scalarized
 from mjx_reinforce.engine.scalar.jaxprs import num_entries
 from mjx_reinforce.engine.team.operations import type_of
 from mjx_reinforce.engine.team.text import CText
 
-#: Warps of a block where there are few episodes, whose threads have 128 registers each, and where
-#: there are many, which have 80.
-FEW_WARPS, _MANY_WARPS = 16, 24
+#: Warps of a block where there are few episodes, whose threads have 128 registers each.
+FEW_WARPS = 16
+#: Where there are many, whose threads have 80.
+_MANY_WARPS = 24
+#: The arguments of a step behind the actor and the state: keys, t, deterministic.
+_NUM_OTHERS = 3
+
+
+class _Leaf(NamedTuple):
+    """An argument or a result of a step: its C++ type, how many entries of how many bytes."""
+
+    type: str
+    size: int
+    itemsize: int
 
 
 class Physics(NamedTuple):
@@ -95,7 +107,7 @@ extern "C" KERNEL play({parameters}) {{
 """
 
 
-def player_text(written: scalarized.Scalarized, physics: Physics, num_actor: int) -> str:
+def player_text(written: scalarized.Scalarized, physics: Physics, num_actor: int) -> Source:
     """Returns the C++ of a kernel with the arguments of ``gpu.kernel.kernel_text``.
 
     Args:
@@ -103,15 +115,17 @@ def player_text(written: scalarized.Scalarized, physics: Physics, num_actor: int
       physics: that of the environment.
       num_actor: how many leaves of its arguments are the actor's.
     """
-    kinds, counts = _kinds(written.in_avals), [*map(num_entries, written.in_avals)]
-    keys, at = len(kinds) - 3, len(kinds) - 2
-    own = range(num_actor, at)  # the state, and the keys behind it
-    words = [-(-counts[k] * np.dtype(written.in_avals[k].dtype).itemsize // 4) for k in own]
-    offsets = dict(zip(own, np.cumsum([0, *words]).tolist(), strict=False))
+    leaves = _leaves(written.in_avals)
+    keys = len(leaves) - _NUM_OTHERS
+    at = keys + 1
+    mode = keys + 2
+    carried = range(num_actor, at)  # the state, and the keys behind it
+    words = [-(-leaves[k].size * leaves[k].itemsize // 4) for k in carried]
+    offsets = dict(zip(carried, np.cumsum([0, *words]).tolist(), strict=False))
 
-    names = {at: "in_at", at + 1: "in_mode"}
+    names = {at: "in_at", mode: "in_mode"}
     text = CText(written, lambda number: names.get(number, f"in{number}"), physics.skip)
-    observation, action, (reward,), (goes_on,), (broken,), *carried = written.outputs
+    observation, action, (reward,), (goes_on,), (broken,), *new_values = written.outputs
     text.line(f"const bool alive = {text.get(goes_on)} != 0;")
     text.line(f"const int is_broken = {text.get(broken)};")
     record = [f"if (t.lane == 0) reward[row * episodes + column] = {text.get(reward)};"]
@@ -119,38 +133,72 @@ def player_text(written: scalarized.Scalarized, physics: Physics, num_actor: int
         f"EACH(i, {len(x)}) {field}[(row * {len(x)} + i) * episodes + column] = {text.array(x)}[i];"
         for field, x in (("observation", observation), ("action", action))
     ]
-    waiting = dict(zip(own, carried, strict=True))
-    while ready := sorted(waiting.keys() & text.read):  # what nothing reads is not carried on
+    # Only what the step reads is carried on. To compute a leaf may read others, which then are
+    # carried on, too: until no unwritten leaf is read.
+    unwritten = dict(zip(carried, new_values, strict=True))
+    while ready := sorted(unwritten.keys() & text.read):
         for number in ready:
-            text.fill(f"out{number}", waiting.pop(number))
-    before, begin = [], []
-    for number in sorted(text.read - {at, at + 1}):
-        kind, size = kinds[number], counts[number]
-        if number < num_actor:
-            before.append(f"const {kind}* in{number} = actor{number} + size_t(seed) * {size};")
-            continue
-        place = f"reinterpret_cast<{kind}*>({{}} + {offsets[number]})"
-        before.append(f"const {kind}* in{number} = {place.format('own')};")
-        before.append(f"{kind}* out{number} = {place.format('following')};")
-        given, size = ("keys", 2) if number == keys else (f"state{number - num_actor}", size)
-        source = f"{given}[size_t(k) * {size} + i]"
-        begin.append(f"EACH(i, {size}) {place.format('own')}[i] = {source};")
-    given = [*zip(("int", "int", "unsigned"), CONTROLS, strict=True)]
-    given += [(kinds[k], f"actor{k}") for k in range(num_actor) if counts[k]]
-    given += [(kinds[k], f"state{k - num_actor}") for k in range(num_actor, keys) if counts[k]]
-    made = [*zip([*_kinds(written.out_avals[:3]), *["int"] * 4], RESULTS, strict=True)]
+            text.fill(f"out{number}", unwritten.pop(number))
+    pointers, initial = _carried_text(text, leaves, offsets, num_actor, keys)
+    inputs = [*zip(("int", "int", "unsigned"), CONTROLS, strict=True)]
+    inputs += [(leaves[k].type, f"actor{k}") for k in range(num_actor) if leaves[k].size]
+    inputs += [
+        (leaves[k].type, f"state{k - num_actor}") for k in range(num_actor, keys) if leaves[k].size
+    ]
+    record_types = [leaf.type for leaf in _leaves(written.out_avals[:3])]
+    results = [*zip([*record_types, *["int"] * 4], RESULTS, strict=True)]
+    # XLA passes the zeros that the results are written over as arguments, too.
+    inputs += [(type_name, f"zero_{name}") for type_name, name in results]
     loop = _PLAY.format(
-        parameters=_parameters([*given, *((kind, f"zero_{name}") for kind, name in made)], made),
+        parameters=_parameters(inputs, results),
         own=sum(words),
-        begin="\n".join(begin),
-        step="\n".join([*before, *text.lines]),
+        begin="\n".join(initial),
+        step="\n".join([*pointers, *text.lines]),
         record="\n".join(record),
         meets=text.meets,
     )
     return _kernel(physics, text, loop, 2 * sum(words) + text.words)
 
 
-def mapping_text(written: scalarized.Scalarized, physics: Physics) -> str:
+def _carried_text(
+    text: CText, leaves: list[_Leaf], offsets: dict[int, int], num_actor: int, keys: int
+) -> tuple[list[str], list[str]]:
+    """Returns the pointers to the arguments that a step reads, and how an episode begins.
+
+    A team has two copies of the state: a step reads ``own`` and writes ``following``, so that no
+    lane reads what another one has written already.
+
+    Args:
+      text: of the step.
+      leaves: the step's arguments.
+      offsets: where each leaf of the state is in a copy, in words of 4 bytes.
+      num_actor: how many leaves are the actor's.
+      keys: the number of the keys.
+    """
+    pointers = []
+    initial = []
+    for number in sorted(text.read & {*range(keys + 1)}):
+        leaf = leaves[number]
+        if number < num_actor:
+            row = f"actor{number} + size_t(seed) * {leaf.size}"
+            pointers.append(f"const {leaf.type}* in{number} = {row};")
+            continue
+        place = f"reinterpret_cast<{leaf.type}*>({{}} + {offsets[number]})"
+        pointers.append(f"const {leaf.type}* in{number} = {place.format('own')};")
+        pointers.append(f"{leaf.type}* out{number} = {place.format('following')};")
+        array = f"state{number - num_actor}"
+        size = leaf.size
+        if number == keys:
+            # An episode begins with one key, of two words. The key of its noise, behind it in the
+            # step's argument, is made by the first step.
+            array = "keys"
+            size = 2
+        source = f"{array}[size_t(k) * {size} + i]"
+        initial.append(f"EACH(i, {size}) {place.format('own')}[i] = {source};")
+    return pointers, initial
+
+
+def mapping_text(written: scalarized.Scalarized, physics: Physics) -> Source:
     """Returns the C++ of a kernel with the arguments of ``gpu.kernel.mapping_text``.
 
     Args:
@@ -158,44 +206,52 @@ def mapping_text(written: scalarized.Scalarized, physics: Physics) -> str:
       physics: that of the environment.
     """
     text = CText(written, lambda number: f"in{number}", physics.skip)
-    given, made = (
-        [(k, type_of(x.dtype), num_entries(x)) for k, x in enumerate(avals) if num_entries(x)]
-        for avals in (written.in_avals, written.out_avals)
+    pointers = []
+    inputs = [("int", "sizes")]
+    results = []
+    for number, leaf in enumerate(_leaves(written.in_avals)):
+        if leaf.size:
+            row = f"argument{number} + size_t(k) * {leaf.size}"
+            pointers.append(f"const {leaf.type}* in{number} = {row};")
+            inputs.append((leaf.type, f"argument{number}"))
+    for number, leaf in enumerate(_leaves(written.out_avals)):
+        if leaf.size:
+            row = f"result{number} + size_t(k) * {leaf.size}"
+            pointers.append(f"{leaf.type}* out{number} = {row};")
+            results.append((leaf.type, f"result{number}"))
+            text.fill(f"out{number}", written.outputs[number])
+    loop = _MAP.format(
+        parameters=_parameters(inputs, results),
+        step="\n".join(pointers + text.lines),
+        meets=text.meets,
     )
-    before = [f"const {kind}* in{k} = given{k} + size_t(k) * {n};" for k, kind, n in given]
-    for k, kind, size in made:
-        before.append(f"{kind}* out{k} = made{k} + size_t(k) * {size};")
-        text.fill(f"out{k}", written.outputs[k])
-    parameters = _parameters(
-        [("int", "sizes"), *((kind, f"given{k}") for k, kind, _ in given)],
-        [(kind, f"made{k}") for k, kind, _ in made],
-    )
-    loop = _MAP.format(parameters=parameters, step="\n".join(before + text.lines), meets=text.meets)
     return _kernel(physics, text, loop, text.words)
 
 
-def _kinds(avals: Iterable[jax.ShapeDtypeStruct]) -> list[str]:
-    return [type_of(x.dtype) for x in avals]
+def _leaves(avals: Iterable[jax.ShapeDtypeStruct]) -> list[_Leaf]:
+    return [_Leaf(type_of(x.dtype), num_entries(x), np.dtype(x.dtype).itemsize) for x in avals]
 
 
-def _parameters(given: Iterable[tuple[str, str]], made: Sequence[tuple[str, str]]) -> str:
+def _parameters(inputs: Iterable[tuple[str, str]], results: Sequence[tuple[str, str]]) -> str:
     """Returns the parameters of a kernel by their types and names: what it reads and writes."""
-    read = (f"const {kind}* __restrict__ {name}" for kind, name in given)
-    return ", ".join([*read, *(f"{kind}* {name}" for kind, name in made), "Word* scratch"])
+    parameters = [f"const {type_name}* __restrict__ {name}" for type_name, name in inputs]
+    parameters += [f"{type_name}* {name}" for type_name, name in results]
+    return ", ".join([*parameters, "Word* scratch"])
 
 
-def _kernel(physics: Physics, text: CText, loop: str, words: int) -> str:
+def _kernel(physics: Physics, text: CText, loop: str, words: int) -> Source:
     """Returns a kernel whose teams have so many words of scratch each, besides far contacts."""
+    # At least one, as a team's scratch is found by this number and XLA has no empty buffer.
     a_thread = max(1, -(-(physics.far + words) // physics.lanes))
-    head = f"#define W {physics.lanes}\n#define SHARED {physics.shared}\n"
-    head += f"#define REPORTS ({' | '.join(text.reports) or 0})\n"
-    head += f"#define FAR_WORDS {physics.far}\n#define THREAD_WORDS {a_thread}\n"
-    whole = f"{_warps(FEW_WARPS)}{head}{physics.text}\n{loop}"
-    return ptx.team_text(whole, physics.lanes, 32 * FEW_WARPS, physics.shared, a_thread)
-
-
-def _warps(number: int) -> str:
-    return f"#define WARPS {number}\n"
+    facts = Facts(
+        threads=WARP * FEW_WARPS,
+        blocks=1,
+        scratch=a_thread,
+        lanes=physics.lanes,
+        shared=physics.shared,
+    )
+    head = f"#define REPORTS ({' | '.join(text.reports) or 0})\n#define FAR_WORDS {physics.far}\n"
+    return Source("cuda", f"{head}{physics.text}\n{loop}", facts)
 
 
 def for_items(kernel: ptx.Kernel, items: int, processors: int, capability: str) -> ptx.Kernel:
@@ -207,11 +263,10 @@ def for_items(kernel: ptx.Kernel, items: int, processors: int, capability: str) 
       processors: the GPU's multiprocessors.
       capability: the GPU's compute capability.
     """
-    if items * kernel.lanes <= kernel.threads * processors:
+    # Where a team of the small blocks has one episode at most, more teams would have none.
+    facts = kernel.facts
+    if items * facts.lanes <= facts.threads * processors:
         return kernel
-
-    def write() -> str:
-        text = kernel.text.partition("\n")[2].replace(_warps(FEW_WARPS), _warps(_MANY_WARPS), 1)
-        return ptx.team_text(text, kernel.lanes, 32 * _MANY_WARPS, kernel.shared, kernel.scratch)
-
-    return ptx.load_kernel(f"{kernel.key} {_MANY_WARPS} warps", write, capability, objects.folder())
+    source = kernel.source._replace(facts=facts._replace(threads=WARP * _MANY_WARPS))
+    name = f"{kernel.key} {_MANY_WARPS} warps"
+    return ptx.load_kernel(name, lambda: source, capability, objects.folder())

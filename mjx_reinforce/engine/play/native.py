@@ -97,7 +97,7 @@ def native_rollout(
 def _begin(env: Environment, program: NativeProgram, keys: jax.Array) -> tuple[Any, jax.Array]:
     """Returns the starts of episodes by their keys [N], and the keys [N] of their noise."""
     begin_by_vmap = jax.vmap(functools.partial(episode.begin, env))
-    if isinstance(program.code, machine.Code) or program.code.lanes == 1:
+    if isinstance(program.code, machine.Code) or program.code.facts.lanes == 1:
         return begin_by_vmap(keys)
 
     # Teams of lanes start a large model, too: in XLA's reset its sums would be atomic on a GPU, and

@@ -18,6 +18,7 @@ from mjx_reinforce.engine.cpu import seam as cpu_seam
 from mjx_reinforce.engine.gpu import kernel as gpu_kernel
 from mjx_reinforce.engine.gpu import ptx, team_kernel
 from mjx_reinforce.engine.gpu import seam as gpu_seam
+from mjx_reinforce.engine.gpu.source import Source
 from mjx_reinforce.engine.play import available
 from mjx_reinforce.engine.play import teams as team
 from mjx_reinforce.engine.play.counter import at_counter, split
@@ -183,8 +184,8 @@ class Writers(NamedTuple):
     """
 
     cpu: Callable[[scalarized.Scalarized, machine.Machine], str]
-    gpu: Callable[[scalarized.Scalarized], str]
-    team: Callable[[scalarized.Scalarized, team_kernel.Physics], str]
+    gpu: Callable[[scalarized.Scalarized], Source]
+    team: Callable[[scalarized.Scalarized, team_kernel.Physics], Source]
 
 
 def load(
@@ -221,19 +222,31 @@ def load(
     traced, shapes = scalarized.trace(function, *examples, unrolled=unrolled)
     source = f"{use} {jaxprs.fingerprint(traced)} {objects.source_digest(*_WRITERS)}"
 
-    def write() -> str:
-        """Writes it out; that takes seconds, and is done where there is no code of this source."""
+    def write() -> tuple[scalarized.Scalarized, str]:
+        """Returns the function written out, and a line of LLVM IR that says what it is.
+
+        That takes seconds, and is done where there is no code of this source.
+        """
         entries = 0 if env is None else observation_size(env)
         written = _write_out(traced, shapes, entries)
-        title = f"; {name}, {sum(written.operations.values()):,} scalar operations\n"
-        if target is None:
-            return title + writers.gpu(written)
-        return title + writers.cpu(written, target)
+        return written, f"; {name}, {sum(written.operations.values()):,} scalar operations\n"
 
-    if target is None:
-        capability = gpu_seam.compute_capability()
-        return ptx.load_kernel(source, write, capability, objects.folder()), shapes
-    return machine.load_module(source, write, handler.NAMES, target, objects.folder()), shapes
+    if target:
+
+        def write_cpu() -> str:
+            written, title = write()
+            return title + writers.cpu(written, target)
+
+        code = machine.load_module(source, write_cpu, handler.NAMES, target, objects.folder())
+        return code, shapes
+
+    def write_gpu() -> Source:
+        written, title = write()
+        kernel_source = writers.gpu(written)
+        return kernel_source._replace(text=title + kernel_source.text)
+
+    capability = gpu_seam.compute_capability()
+    return ptx.load_kernel(source, write_gpu, capability, objects.folder()), shapes
 
 
 def _write_out(traced: jaxprs.Program, shapes: Any, entries: int = 0) -> scalarized.Scalarized:
@@ -265,7 +278,7 @@ def _by_teams(
             physics = team.team_physics(model)
             source = f"{jaxprs.fingerprint(traced)} {physics} {objects.source_digest(*_WRITERS)}"
 
-            def write() -> str:
+            def write() -> Source:
                 return writers.team(_write_out(traced, shapes), physics)
 
             capability = gpu_seam.compute_capability()

@@ -20,8 +20,11 @@ _TYPES = {
     "float32": "float",
     "float64": "double",
 }
-_NAMES, _SIGNS = "add sub mul and or xor eq ne lt le gt ge", "+ - * & | ^ == != < <= > >="
-_INFIX = dict(zip(_NAMES.split(), _SIGNS.split(), strict=True))
+_OPERATIONS = "add sub mul and or xor eq ne lt le gt ge"
+_SIGNS = "+ - * & | ^ == != < <= > >="
+_INFIX = dict(zip(_OPERATIONS.split(), _SIGNS.split(), strict=True))
+#: What a literal of a float ends with, and the integer that its bits are.
+_FLOATS = {"float": ("f", "unsigned"), "double": ("", "unsigned long long")}
 #: Functions of floats that the C library and CUDA have under these names, with an f for float32.
 _LIBRARY = {
     **dict.fromkeys(("floor", "ceil", "sqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p")),
@@ -31,7 +34,7 @@ _LIBRARY = {
     "erf_inv": "erfinv",
 }
 #: Functions of ``device/scalar.h``.
-_OURS = {
+_DEVICE_FUNCTIONS = {
     "max": "larger",
     "min": "smaller",
     "div": "divide",
@@ -55,17 +58,23 @@ def type_of(dtype: np.dtype) -> str:
 
 def literal(number: np.generic) -> str:
     """Returns a constant in C++, to the bit."""
-    kind, name = number.dtype.kind, type_of(number.dtype)
-    if kind == "b":
-        return "true" if number else "false"
-    if kind in "iu":
-        suffix = ("u" if kind == "u" else "") + ("ll" if number.dtype.itemsize == 8 else "")
+    itemsize = number.dtype.itemsize
+    name = type_of(number.dtype)
+    if name == "bool":
+        return str(bool(number)).lower()
+    if name not in _FLOATS:
+        suffix = "ll" if itemsize == 8 else ""
+        if number.dtype.kind == "u":
+            suffix = f"u{suffix}"
         return f"({name})({int(number)}{suffix})"
+    suffix, word = _FLOATS[name]
     if not np.isfinite(number):
-        word = "unsigned" if name == "float" else "unsigned long long"
-        return f"bits<{name}>(({word})({int(number.view(f'u{number.dtype.itemsize}'))}ull))"
-    exact = float(number).hex() if number else repr(float(number))
-    return exact + ("f" if name == "float" else "")
+        # C++ has no literal for infinity, nor for the payload of a NaN.
+        return f"bits<{name}>(({word})({int(number.view(f'u{itemsize}'))}ull))"
+    if not number:
+        return repr(float(number)) + suffix
+    # Hexadecimal digits are exact: no rounding by Python's or by C++'s conversion.
+    return float(number).hex() + suffix
 
 
 def expression(op: Op, dtype: np.dtype, kinds: list[np.dtype], args: list[str]) -> str:
@@ -77,38 +86,45 @@ def expression(op: Op, dtype: np.dtype, kinds: list[np.dtype], args: list[str]) 
       kinds: the dtypes of its operands.
       args: its operands.
     """
-    name, kind, of = op.name, np.dtype(dtype).kind, np.dtype(kinds[-1])
-    suffix = "f" if of == np.float32 else ""
+    name = op.name
+    is_bool = np.dtype(dtype).kind == "b"
+    operand_dtype = np.dtype(kinds[-1])
+    is_float = operand_dtype.kind == "f"
+    suffix = "f" if operand_dtype == np.float32 else ""
     if name in _INFIX:
         return f"{args[0]} {_INFIX[name]} {args[1]}"
     if name == "select_n":
         return _select(kinds[0], args)
     if name == "convert_element_type":
-        return f"{args[0]} != 0" if kind == "b" else f"({type_of(dtype)})({args[0]})"
+        # A cast to an integer type would cut 0.5 to 0; as a bool it is true.
+        return f"{args[0]} != 0" if is_bool else f"({type_of(dtype)})({args[0]})"
     if name == "bitcast_convert_type":
         return f"bits<{type_of(dtype)}>({args[0]})"
     if name == "not":
-        return f"{'!' if kind == 'b' else '~'}{args[0]}"
+        return f"!{args[0]}" if is_bool else f"~{args[0]}"
     if name == "neg":
         return f"-{args[0]}"
-    if name == "round" and of.kind == "f":
+    if name == "round" and is_float:
         to_even = int(dict(op.params)["rounding_method"]) == 1  # type: ignore[call-overload]
-        return f"{'rint' if to_even else 'round'}{suffix}({args[0]})"
-    if name in _LIBRARY and of.kind == "f":
+        function = "rint" if to_even else "round"
+        return f"{function}{suffix}({args[0]})"
+    if name in _LIBRARY and is_float:
         return f"{_LIBRARY[name] or name}{suffix}({', '.join(args)})"
-    if name == "abs":
+    if name == "abs":  # of integers: the library's would be fabs
         return f"{args[0]} < 0 ? -{args[0]} : {args[0]}"
-    if name in _OURS:
-        return f"{_OURS[name]}({', '.join(args)})"
+    if name in _DEVICE_FUNCTIONS:
+        return f"{_DEVICE_FUNCTIONS[name]}({', '.join(args)})"
     assert name in FACTS
     raise UnsupportedPrimitive(f"it has no C++ for {name!r}")
 
 
-def _select(which: np.dtype, args: list[str]) -> str:
-    number, *cases = args
-    if which == np.bool_:
-        return f"{number} ? {cases[1]} : {cases[0]}"
-    chosen = cases[0]
+def _select(index_dtype: np.dtype, args: list[str]) -> str:
+    """Returns the case that a bool or an integer, the first of ``args``, chooses."""
+    index, *cases = args
+    if index_dtype == np.bool_:
+        return f"{index} ? {cases[1]} : {cases[0]}"
+    # The last test that holds decides: an index out of range gets the nearest case.
+    choice = cases[0]
     for k, case in enumerate(cases[1:], start=1):
-        chosen = f"{number} >= {k} ? {case} : ({chosen})"
-    return chosen
+        choice = f"{index} >= {k} ? {case} : ({choice})"
+    return choice

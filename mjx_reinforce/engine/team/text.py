@@ -18,6 +18,7 @@ from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive
 from mjx_reinforce.engine.scalar.nodes import Call, Node, Scalar, identity, is_constant, same
 from mjx_reinforce.engine.scalar.passes import liveness
 from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop, Schedule
+from mjx_reinforce.engine.team.formulas import Formulas, Place, sum_terms
 from mjx_reinforce.engine.team.operations import expression, literal, type_of
 
 #: Fewer scalars of one formula are computed one by one.
@@ -40,23 +41,16 @@ _SUMS = {
     "add": _Sum("0", "+", "t.sum({})"),
 }
 #: What the physics reads, in the order of the operation's operands.
-_GIVEN = ("ctrl", "time", "qpos", "qvel", "act", "qacc_warmstart")
+_OPERANDS = ("ctrl", "time", "qpos", "qvel", "act", "qacc_warmstart")
 #: What it computes for the task alone, where that reads it.
 _REPORTED = ("xpos", "xipos", "cinert", "cvel", "cfrc_ext")
 #: Where the device code has the fields of a simulation, by MuJoCo's names.
-_FIELDS = {field: f"s.{field}" for field in (*_GIVEN, *_REPORTED, "qfrc_actuator")}
+_FIELDS = {field: f"s.{field}" for field in (*_OPERANDS, *_REPORTED, "qfrc_actuator")}
 #: The operations that simulate, as the device code has them, and how often teams meet in them.
 _SIMULATES = {
     "physics": ("const bool {}[1] = {{physics({}, M, s, {})}};", " + {} * STAGES"),
     "start": ("const bool {}[1] = {{true}}; start({}, M, s);", " + 1"),
 }
-
-
-class Place(NamedTuple):
-    """An array of scalars in memory, and which of them is meant."""
-
-    array: str
-    entry: int
 
 
 class CText(Backend[str]):
@@ -80,8 +74,10 @@ class CText(Backend[str]):
         self.words = 0
         self.read: set[int] = set()
         self.reports: list[str] = []
-        self.meets, self._depth = "0", 0
-        self._inputs, self._skip = inputs, skip
+        self.meets = "0"
+        self._depth = 0
+        self._inputs = inputs
+        self._skip = skip
         self._values: dict[Node, str] = {}
         self._steps = _owners(written.schedule)
         ends = [x for leaf in written.outputs for x in leaf]
@@ -91,8 +87,7 @@ class CText(Backend[str]):
         self._prepared: set[Node] = set()
         self._arrays: dict[tuple[Call, int], str] = {}
         self._written: dict[Node, Place] = {}
-        self._forms: dict[Any, int] = {}
-        self._form_of: dict[Node, int] = {}
+        self._formulas = Formulas(self._place, lambda node: node in self._written)
         self._count = 0
 
     def line(self, text: str) -> None:
@@ -111,9 +106,11 @@ class CText(Backend[str]):
 
     def array(self, scalars: Sequence[Scalar]) -> str:
         """Returns an array of scalars of the program: where they are, or a new one."""
-        found = liveness.evenly_spaced([self._place(x) for x in scalars])
-        if found and found[2] == int(len(scalars) > 1):
-            return f"({found[0]} + {found[1]})"
+        spacing = liveness.evenly_spaced([self._place(x) for x in scalars])
+        if spacing:
+            name, start, stride = spacing
+            if stride == int(len(scalars) > 1):  # side by side; that of one scalar is 0
+                return f"({name} + {start})"
         array = self._reserve(scalars[0].dtype, len(scalars))
         self.fill(array, scalars)
         self.line("t.sync();")
@@ -123,7 +120,10 @@ class CText(Backend[str]):
     def fill(self, array: str, scalars: Sequence[Scalar]) -> None:
         """Writes scalars of the program into an array."""
         self._prepare(scalars)
-        start, runs = 0, [list(run) for _, run in itertools.groupby(scalars, self._form)]
+        # Neighbors of one formula are computed by the lanes together. All are grouped before any is
+        # written, as writing one changes what others are computed from.
+        runs = [list(run) for _, run in itertools.groupby(scalars, self._formulas.number)]
+        start = 0
         for run in runs:
             if len(run) < _FEWEST:
                 for k, x in enumerate(run, start=start):
@@ -131,8 +131,6 @@ class CText(Backend[str]):
             else:
                 self._each(run, f"{array}[{start} + i] = {{}};")
             start += len(run)
-
-    # ------------------------------------------------------------------- what a Backend makes
 
     def constant(self, number: Any) -> str:
         """A literal."""
@@ -146,6 +144,7 @@ class CText(Backend[str]):
 
     def value(self, scalar: Scalar, values: dict[Node, str]) -> str:
         """Returns a scalar, once what it needs is written."""
+        # With a stack of its own: a formula may be nested deeper than Python's calls.
         waiting = [] if is_constant(scalar) else [scalar]
         while waiting:
             node = waiting.pop()
@@ -165,8 +164,8 @@ class CText(Backend[str]):
         """Writes one operation."""
         assert node.op is not None
         name = self.name()
-        made = expression(node.op, node.dtype, [x.dtype for x in node.args], operands)
-        self.line(f"const {type_of(node.dtype)} {name} = {made};")
+        formula = expression(node.op, node.dtype, [x.dtype for x in node.args], operands)
+        self.line(f"const {type_of(node.dtype)} {name} = {formula};")
         return name
 
     def gate(self, gate: LiveGate, values: dict[Node, str]) -> Sequence[str]:
@@ -175,11 +174,16 @@ class CText(Backend[str]):
         for out in gate.outs:
             groups.setdefault(out.leaf.dtype, []).append(out)
         arrays = [(self._reserve(dtype, len(outs)), outs) for dtype, outs in groups.items()]
-        for start, way in (f"if ({self.value(gate.predicate, values)}) {{", 1), ("} else {", 2):
-            self.line(start)
-            with self._inside(gate.body if way == 1 else [], {}):
-                for array, outs in arrays:
-                    self.fill(array, [out[way] for out in outs])
+        # Both sides fill the same arrays. The body is the first side's; the other side has values
+        # of before.
+        self.line(f"if ({self.value(gate.predicate, values)}) {{")
+        with self._inside(gate.body, {}):
+            for array, outs in arrays:
+                self.fill(array, [out.hot for out in outs])
+        self.line("} else {")
+        with self._inside([], {}):
+            for array, outs in arrays:
+                self.fill(array, [out.cold for out in outs])
         self.lines += ["}", "t.sync();"]
         for array, outs in arrays:
             self._written.update({out.leaf: Place(array, k) for k, out in enumerate(outs)})
@@ -187,33 +191,43 @@ class CText(Backend[str]):
 
     def loop(self, loop: LiveLoop, values: dict[Node, str]) -> Sequence[str]:
         """Writes a loop."""
-        known, names, kept = {}, [], []
+        local_values = {}
+        names = []
         for carry in loop.carries:
-            names.append(self.name())
+            name = self.name()
             init = self.value(carry.init, values)
-            self.line(f"{type_of(carry.leaf.dtype)} {names[-1]} = {init};")
-            known[carry.leaf] = names[-1]
+            self.line(f"{type_of(carry.leaf.dtype)} {name} = {init};")
+            names.append(name)
+            local_values[carry.leaf] = name
         rows = [self._row(element.values, values) for element in loop.elements]
+        arrays = []
         for record in loop.records:
-            kept.append(self.name())
-            self.line(f"{type_of(record.value.dtype)} {kept[-1]}[{loop.length}];")
+            arrays.append(self.name())
+            self.line(f"{type_of(record.value.dtype)} {arrays[-1]}[{loop.length}];")
         count = self.name()
-        conditions = [] if loop.length is None else [f"{count} < {loop.length}"]
-        conditions += [] if loop.active is None else [names[loop.active]]
+        conditions = []
+        if loop.length is not None:
+            conditions.append(f"{count} < {loop.length}")
+        if loop.active is not None:
+            conditions.append(names[loop.active])
         self.line(f"for (int {count} = 0; {' && '.join(conditions)}; {count}++) {{")
         for element, row in zip(loop.elements, rows, strict=True):
-            known[element.leaf] = row(count)
-        nexts = [self.name() for _ in names]
-        with self._inside(loop.body, known):
-            for record, array in zip(loop.records, kept, strict=True):
+            local_values[element.leaf] = row(count)
+        # All that is carried is computed before any of it changes: each may read the others.
+        next_names = [self.name() for _ in names]
+        with self._inside(loop.body, local_values):
+            for record, array in zip(loop.records, arrays, strict=True):
                 self.line(f"{array}[{count}] = {self.get(record.value)};")
-            for carry, following in zip(loop.carries, nexts, strict=True):
-                kind = type_of(carry.leaf.dtype)
-                self.line(f"const {kind} {following} = {self.get(carry.next)};")
-        self.lines += [f"{name} = {x};" for name, x in zip(names, nexts, strict=True)]
+            for carry, next_name in zip(loop.carries, next_names, strict=True):
+                type_name = type_of(carry.leaf.dtype)
+                self.line(f"const {type_name} {next_name} = {self.get(carry.next)};")
+        for name, next_name in zip(names, next_names, strict=True):
+            self.line(f"{name} = {next_name};")
         self.lines += ["t.sync();", "}"]  # the next round may write what this one reads
-        each = zip(loop.records, kept, strict=True)
-        return [*names, *(f"{array}[{t}]" for x, array in each for t in range(len(x.outs)))]
+        results = list(names)
+        for record, array in zip(loop.records, arrays, strict=True):
+            results += [f"{array}[{t}]" for t in range(len(record.outs))]
+        return results
 
     def call(self, call: Call, values: dict[Node, str]) -> Sequence[str]:
         """Writes an operation of the device code."""
@@ -226,22 +240,23 @@ class CText(Backend[str]):
         arrays = enumerate(call.outs)
         return [f"{self._arrays[call, n]}[{k}]" for n, out in arrays for k in range(len(out))]
 
-    # -------------------------------------------------------------------- what is written before
-
     def _prepare(self, scalars: Sequence[Scalar]) -> None:
         """Writes the steps, such as a call or a loop, that scalars need and that are not yet."""
-        waiting, seen = list(scalars), set()
+        waiting = list(scalars)
+        visited = set()
         while waiting:
             node = waiting.pop()
-            if not isinstance(node, Node) or node in seen or node in self._prepared:
+            if not isinstance(node, Node) or node in visited or node in self._prepared:
                 continue
-            seen.add(node)
+            visited.add(node)
             waiting += node.args
             if node in self._steps and node not in self._values:
                 self._write(self._steps[node])
-        self._prepared |= seen
+        self._prepared |= visited
 
     def _write(self, step: LiveGate | LiveLoop | Call) -> None:
+        """Writes a step of the program, and before it the steps that it needs."""
+        # What it reads of its own body is deeper, and is written within it.
         depth = liveness.results(step)[0].scope.depth
         needs = [x for x in liveness.reads([step]) if x.scope.depth <= depth]
         self._prepare(needs)
@@ -251,16 +266,20 @@ class CText(Backend[str]):
         self.run([step], self._values)
 
     @contextlib.contextmanager
-    def _inside(self, body: Schedule, known: Mapping[Node, str]) -> Iterator[None]:
+    def _inside(self, body: Schedule, local_values: Mapping[Node, str]) -> Iterator[None]:
         """Within this, what is written is known in the body of a loop or a branch alone."""
-        before = self._values, self._written
-        self._values, self._written = {**self._values, **known}, dict(self._written)
+        outer_values = self._values
+        outer_places = self._written
+        self._values = {**outer_values, **local_values}
+        self._written = dict(outer_places)
         self._steps |= _owners(body)
         self._depth += 1
         yield
         self._depth -= 1
-        self._values, self._written = before
-        self._form_of.clear()
+        self._values = outer_values
+        self._written = outer_places
+        # A form may name an array of the body, which is not there any more.
+        self._formulas.forget()
 
     def _place(self, scalar: Scalar) -> Place | None:
         """Returns where an argument, a result of a call or an entry of an array is, or None."""
@@ -280,10 +299,11 @@ class CText(Backend[str]):
 
     def _reserve(self, dtype: np.dtype, count: int) -> str:
         """Returns a new array that all lanes of the team see."""
-        name, kind = self.name(), type_of(dtype)
+        name = self.name()
+        type_name = type_of(dtype)
         size = -(-np.dtype(dtype).itemsize // 4)
-        self.words += self.words % size
-        self.line(f"{kind}* {name} = reinterpret_cast<{kind}*>(scratch + {self.words});")
+        self.words += self.words % size  # numbers of 8 bytes begin at an even word
+        self.line(f"{type_name}* {name} = reinterpret_cast<{type_name}*>(scratch + {self.words});")
         self.words += count * size
         return name
 
@@ -292,38 +312,47 @@ class CText(Backend[str]):
         computed = {x: k for k, x in enumerate(scalars) if isinstance(x, Node) and x.op}
         self._values.update({x: f"{array}[{k}]" for x, k in computed.items()})
         self._written.update({x: Place(array, k) for x, k in computed.items()})
-        self._form_of.clear()  # of what is computed from these, too
+        self._formulas.forget()  # of what is computed from these, too
 
     def _layer(self, call: Call) -> None:
+        """Writes a layer of a network, whose units are the lanes'."""
         x, kernel, bias = map(self.array, call.args)
         (units,) = call.outs
-        made = self._arrays[call, 0] = self._reserve(units[0].dtype, len(units))
+        activations = self._reserve(units[0].dtype, len(units))
+        self._arrays[call, 0] = activations
         is_tanh = str(call.name == "tanh_layer").lower()
         sizes = f"{len(call.args[0])}, {len(units)}"
-        self.lines += [f"layer<{is_tanh}>(t, {x}, {kernel}, {bias}, {sizes}, {made});", "t.sync();"]
+        self.line(f"layer<{is_tanh}>(t, {x}, {kernel}, {bias}, {sizes}, {activations});")
+        self.line("t.sync();")
 
     def _simulate(self, call: Call) -> None:
+        """Writes a call of the physics, whose state ``s`` is one for all calls of a program."""
         names = [field.rpartition(".")[2] for field in call.fields]
         sound = self.name()
         fields = {**_FIELDS, "sound": sound}
-        for field, scalars in zip(_GIVEN, call.args, strict=True):
+        for field, scalars in zip(_OPERANDS, call.args, strict=True):
             if scalars:
                 self.fill(_FIELDS[field], scalars)
         if self._simulates_once:
             self._read_from(_FIELDS["ctrl"], call.args[0])  # which the physics leaves as it is
         simulate, meets = _SIMULATES[call.name]
-        self.meets += "" if self._depth else meets.format(self._skip)
-        team = "t.alone()" if self._depth else "t"
+        if self._depth:
+            # In a branch or a loop other teams may not come to the meetings.
+            team = "t.alone()"
+        else:
+            team = "t"
+            self.meets += meets.format(self._skip)
         self.lines += ["t.sync();", simulate.format(sound, team, self._skip)]
         for number, (name, out) in enumerate(zip(names, call.outs, strict=True)):
             if out and name not in fields:
                 raise UnsupportedPrimitive(f"the task reads {name} of the simulation")
-            made = fields.get(name, "")
+            array = fields.get(name, "")
             if out and not self._simulates_once:  # another operation may overwrite it
-                made = self._reserve(out[0].dtype, len(out))
-                self.line(f"EACH(i, {len(out)}) {made}[i] = {fields[name]}[i];")
-            self._arrays[call, number] = made
-            self.reports += [name.upper()] if out and name in _REPORTED else []
+                array = self._reserve(out[0].dtype, len(out))
+                self.line(f"EACH(i, {len(out)}) {array}[i] = {fields[name]}[i];")
+            self._arrays[call, number] = array
+            if out and name in _REPORTED:
+                self.reports.append(name.upper())
         self.line("t.sync();")
 
     def _row(self, row: list[Scalar], values: dict[Node, str]) -> Callable[[str], str]:
@@ -331,32 +360,23 @@ class CText(Backend[str]):
         if spaced := self._spaced(row):
             return spaced
         name = self.name()
-        given = ", ".join(self.value(x, values) for x in row)
-        fixed = "static const " if all(map(is_constant, row)) else "const "
-        self.line(f"{fixed}{type_of(row[0].dtype)} {name}[] = {{{given}}};")
+        entries = ", ".join(self.value(x, values) for x in row)
+        self.line(f"{_qualifier(row)} {type_of(row[0].dtype)} {name}[] = {{{entries}}};")
         return lambda count: f"{name}[{count}]"
 
     def _spaced(self, row: Sequence[Scalar]) -> Callable[[str], str] | None:
         """Returns what the k-th of evenly spaced elements of one array is; None for others."""
-        if not (found := liveness.evenly_spaced([self._place(x) for x in row])):
+        spacing = liveness.evenly_spaced([self._place(x) for x in row])
+        if not spacing:
             return None
-        array, start, stride = found
+        array, start, stride = spacing
         return lambda count: f"{array}[{start} + {stride} * {count}]"
 
-    # ------------------------------------------------------------------------- lanes together
-
     def _terms(self, node: Node) -> list[Scalar]:
-        """Returns what a node adds up, in order, where nothing else reads the sums between."""
+        """Returns the terms of a sum that the lanes may share; none of what is no such sum."""
         if node.op is None or node.op.name not in _SUMS or node.dtype.kind not in "bf":
             return []
-        waiting, terms = list(node.args), []
-        while waiting:
-            x = waiting.pop()
-            if isinstance(x, Node) and x.op == node.op and self._uses[x] == 1:
-                waiting += x.args
-            else:
-                terms.append(x)
-        return terms[::-1]
+        return sum_terms(node, self._uses)
 
     def _sum(
         self, kind: _Sum, dtype: np.dtype, terms: list[Scalar], values: dict[Node, str]
@@ -364,9 +384,12 @@ class CText(Backend[str]):
         """Writes a sum whose terms of one formula the lanes share; returns its name."""
         groups: dict[int, list[Scalar]] = {}
         for x in terms:
-            groups.setdefault(self._form(x), []).append(x)
-        name, total = self.name(), self.name()
+            groups.setdefault(self._formulas.number(x), []).append(x)
+        name = self.name()
+        total = self.name()
         self.line(f"{type_of(dtype)} {name} = {kind.start};")
+        # Each lane adds up its terms of each formula, then the lanes meet; what is left is added by
+        # all lanes alike.
         alone = []
         for group in groups.values():
             if len(group) < _FEWEST:
@@ -386,8 +409,8 @@ class CText(Backend[str]):
         """
         tables: list[str] = []
         body: list[str] = []
-        made = self._together(list(run), tables, body)
-        self.lines += [*tables, f"EACH(i, {len(run)}) {{", *body, use.format(made), "}"]
+        formula = self._together(list(run), tables, body)
+        self.lines += [*tables, f"EACH(i, {len(run)}) {{", *body, use.format(formula), "}"]
 
     def _together(self, run: list[Scalar], tables: list[str], body: list[str]) -> str:
         """Returns scalars of one formula as an expression of their number i.
@@ -397,73 +420,67 @@ class CText(Backend[str]):
           tables: lines before the loop over i, to which those needed are added.
           body: lines within the loop, likewise.
         """
-        known: dict[tuple, str] = {}
+        # A column is the scalars that stand at one place of the formula, one for each i: the run is
+        # the column of the whole formula, and the operands of a column's operations are columns.
+        expressions: dict[tuple, str] = {}
         waiting = [run]
         while waiting:
             column = waiting.pop()
             key = tuple(map(identity, column))
-            if key in known:
+            if key in expressions:
                 continue
-            if found := self._uniform(column, tables):
-                known[key] = found
+            if uniform := self._uniform(column, tables):
+                expressions[key] = uniform
                 continue
-            parts = [list(x) for x in zip(*(x.args for x in column), strict=True)]
-            keys = [tuple(map(identity, part)) for part in parts]
-            if missing := [part for part, k in zip(parts, keys, strict=True) if k not in known]:
+            columns = [list(x) for x in zip(*(x.args for x in column), strict=True)]
+            keys = [tuple(map(identity, operand)) for operand in columns]
+            missing = [x for x, k in zip(columns, keys, strict=True) if k not in expressions]
+            if missing:
                 waiting += [column, *missing]
                 continue
-            first, name = column[0], self.name()
-            kinds, operands = [x.dtype for x in first.args], [known[k] for k in keys]
-            made = expression(first.op, first.dtype, kinds, operands)
-            body.append(f"const {type_of(first.dtype)} {name} = {made};")
-            known[key] = name
-        return known[tuple(map(identity, run))]
+            example = column[0]
+            name = self.name()
+            dtypes = [x.dtype for x in example.args]
+            operands = [expressions[k] for k in keys]
+            formula = expression(example.op, example.dtype, dtypes, operands)
+            body.append(f"const {type_of(example.dtype)} {name} = {formula};")
+            expressions[key] = name
+        return expressions[tuple(map(identity, run))]
 
     def _uniform(self, column: list[Scalar], tables: list[str]) -> str | None:
         """Returns scalars that are all the same, or not computed here; None for others."""
-        first, name = column[0], self.name()
-        if all(same(x, first) for x in column):
-            before, self.lines = self.lines, tables
-            made = self.value(first, self._values)
-            self.lines = before
-            return made
+        example = column[0]
+        name = self.name()
+        if all(same(x, example) for x in column):
+            # It is computed before the loop over i, once.
+            lines = self.lines
+            self.lines = tables
+            value = self.value(example, self._values)
+            self.lines = lines
+            return value
         if spaced := self._spaced(column):
             return spaced("i")
-        if is_constant(first):
-            given = ", ".join(map(literal, column))
-            tables.append(f"static const {type_of(first.dtype)} {name}[] = {{{given}}};")
+        if is_constant(example):
+            numbers = ", ".join(map(literal, column))
+            kind = f"{_qualifier(column)} {type_of(example.dtype)}"
+            tables.append(f"{kind} {name}[] = {{{numbers}}};")
             return f"{name}[i]"
+        # Scalars of one form that are in memory are in one array: the form names it.
         places = [x for x in map(self._place, column) if x]
         if places:
-            given = ", ".join(str(x.entry) for x in places)
-            tables.append(f"static const int {name}[] = {{{given}}};")
+            entries = ", ".join(str(x.entry) for x in places)
+            tables.append(f"static const int {name}[] = {{{entries}}};")
             return f"{places[0].array}[{name}[i]]"
         return None
 
-    def _form(self, scalar: Scalar) -> int:
-        """Returns a number for the form of a scalar: its formula, whatever its numbers are."""
-        if is_constant(scalar):
-            return self._number(("constant", scalar.dtype.name))
-        waiting = [scalar]
-        while waiting:
-            node = waiting.pop()
-            args = () if node in self._written else node.args
-            missing = [x for x in args if isinstance(x, Node) and x not in self._form_of]
-            if missing:
-                waiting += [node, *missing]
-            elif node not in self._form_of:
-                self._form_of[node] = self._number(self._facts(node))
-        return self._form_of[scalar]
 
-    def _facts(self, node: Node) -> tuple:
-        if place := self._place(node):
-            return ("in", place.array)
-        if node.op is None:
-            return ("itself", node.index)
-        return (node.op, node.dtype.name, *(self._form(x) for x in node.args))
-
-    def _number(self, form: tuple) -> int:
-        return self._forms.setdefault(form, len(self._forms))
+def _qualifier(entries: Sequence[Scalar]) -> str:
+    """Returns what a table of scalars is declared as."""
+    # A static table is in memory, once for all; another one is made of registers each time. NVRTC
+    # makes no static table of what a function returns, as ``literal`` has infinity and NaN.
+    if all(is_constant(x) and np.isfinite(x) for x in entries):
+        return "static const"
+    return "const"
 
 
 def _owners(body: Schedule) -> dict[Node, LiveGate | LiveLoop | Call]:

@@ -17,6 +17,7 @@ from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.cpu import handler, machine
 from mjx_reinforce.engine.gpu import ptx, seam
 from mjx_reinforce.engine.gpu.ptx import Assembler
+from mjx_reinforce.engine.gpu.source import Facts
 from mjx_reinforce.engine.play import available
 
 if reason := available.unavailable():
@@ -26,8 +27,9 @@ pytestmark = pytest.mark.cpu
 
 POINTER, COUNT = ctypes.c_void_p, ctypes.c_uint
 LAUNCH = ctypes.CFUNCTYPE(ctypes.c_int, POINTER, *[COUNT] * 7, *[POINTER] * 3)
-TEXT = "// .maxntid 32\n// .minnctapersm 16\n"
-KERNEL = ptx.Kernel("0" * 64, TEXT, 32, 16, 0, compiled=True)
+TEXT = "// PTX\n"
+KERNEL = ptx.Kernel("0" * 64, "ptx", TEXT, Facts(threads=32, blocks=16), compiled=True)
+HEAD = '{"language": "ptx", "threads": 32, "blocks": 16, "scratch": 0, "lanes": 1, "shared": 0}\n'
 
 
 class Driver:
@@ -273,7 +275,7 @@ def test_an_exported_program_finds_its_kernel_again(in_memory, monkeypatch, tmp_
     content = bytes(made.serialize())
     seam._HANDLERS.clear()
     assert not seam.restore(content)
-    objects.write_object(tmp_path, KERNEL.key, TEXT.encode())
+    objects.write_object(tmp_path, KERNEL.key, (HEAD + TEXT).encode())
     assert seam.restore(content)
     assert registered == [(seam._target(KERNEL.key), "CUDA")] * 2
     assert filled[1] == (KERNEL._replace(compiled=False), assemblers, tmp_path)

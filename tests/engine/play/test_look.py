@@ -14,6 +14,7 @@ from toys import Drifting
 from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.gpu import ptx
+from mjx_reinforce.engine.gpu.source import Facts, Source
 from mjx_reinforce.engine.objects import distrust
 from mjx_reinforce.engine.play import available, program
 from mjx_reinforce.engine.play.choice import machine_code
@@ -70,7 +71,8 @@ def test_code_on_disk_is_built_again_and_described(monkeypatch, tmp_path, capfd)
 def test_a_kernel_for_a_gpu(monkeypatch, tmp_path, capfd):
     """Its assembler's log is told where it is assembled: see test_gpu_launch."""
     monkeypatch.setenv(objects.DEBUG, "1")
-    made = ptx.load_kernel("toy", lambda: KERNEL, "9.0", tmp_path)
+    source = Source("llvm", KERNEL, Facts(threads=32, blocks=16))
+    made = ptx.load_kernel("toy", lambda: source, "9.0", tmp_path)
     said = capfd.readouterr().err
     assert said.startswith(f"kernel {made.key}: Toy, 7 scalar operations; LLVM took ")
     assert (tmp_path / f"{made.key}.ll").read_text() == KERNEL

@@ -137,11 +137,18 @@ def test_ptx(busy, long, tmp_path, monkeypatch):
     env, player = busy
     if long:
         monkeypatch.setattr(kernels, "LONG", 4)
-    text = kernel_text(env, *player)
+    llvm = kernel_text(env, *player)
+
+    def on_disk():
+        pytest.fail("it is on disk")
+
     for capability in ("7.5", "9.0"):
-        made = ptx.load_kernel(text, lambda: text, capability, tmp_path)
-        assert made.compiled
-        assert (made.threads, made.blocks) == ((256, 1) if long else (32, 16))
+        made = ptx.load_kernel(llvm.text, lambda: llvm, capability, tmp_path)
+        assert (made.compiled, made.language) == (True, "ptx")
+        threads, blocks = made.facts[:2]
+        assert (threads, blocks) == ((256, 1) if long else (32, 16))
+        assert f".maxntid {threads}" in made.text
+        assert f".minnctapersm {blocks}" in made.text
         assert made.text.count(".entry play(") == 1
         assert f".target sm_{capability.replace('.', '')}" in made.text
         assert "call" not in made.text
@@ -150,7 +157,7 @@ def test_ptx(busy, long, tmp_path, monkeypatch):
         assert meetings
         assert all(meetings)  # a warp comes together before each: an H200 waited forever without
         ptx._LOADED.clear()
-        again = ptx.load_kernel(text, lambda: pytest.fail("it is on disk"), capability, tmp_path)
+        again = ptx.load_kernel(llvm.text, on_disk, capability, tmp_path)
         assert again == made._replace(compiled=False)
         if shutil.which("ptxas"):
             source = tmp_path / "play.ptx"

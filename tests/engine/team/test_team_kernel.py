@@ -1,15 +1,19 @@
 """Kernels for teams of lanes, compiled with one lane for this CPU, beside its machine code."""
 
+import re
+
 import gpu_on_cpu
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from players import actor_and_act, only_active, played
 
 from mjx_reinforce import envs, make_vec
-from mjx_reinforce.engine.gpu import nvrtc, ptx
-from mjx_reinforce.engine.play import available, native
+from mjx_reinforce.engine.gpu import nvrtc, ptx, team_kernel
+from mjx_reinforce.engine.play import available, native, program
 from mjx_reinforce.engine.play import teams as team
+from mjx_reinforce.engine.scalar import scalarized
 
 if reason := available.unavailable():
     pytest.skip(reason, allow_module_level=True)
@@ -44,7 +48,7 @@ def test_teams_play_the_same_episodes(teams, name):
     want = played(native.native_rollout, env, player, **options)
     made = teams()
     got = played(native.native_rollout, env, player, **options)
-    assert [kernel.lanes for kernel in made] == [16, 16]  # one plays, one begins
+    assert [kernel.facts.lanes for kernel in made] == [16, 16]  # one plays, one begins
     first = min(horizon, 12)  # steps until rounding has grown
     for name in ("observation", "action", "reward"):
         pair = (getattr(x, name)[:, :first] for x in (got, want))
@@ -53,13 +57,24 @@ def test_teams_play_the_same_episodes(teams, name):
     np.testing.assert_array_equal(got.simulated, got.mask.sum((1, 2)))
 
 
+def test_a_table_with_infinity_is_not_static():
+    """NVRTC initializes static tables by literals alone, and C++ has none for infinity."""
+    limits = np.array([0.7, np.inf, 100, 100, 100, 100], np.float32)
+    function = scalarized.trace(lambda x: x + limits, jnp.zeros(6))
+    written = scalarized.build(*function, program.BRANCH_COST, program.SCANS)
+    physics = team_kernel.Physics("", far=0, skip=1, lanes=16, shared=0)
+    text = team_kernel.mapping_text(written, physics).text
+    assert "bits<float>" in text
+    assert not re.search(r"static const float .*bits<float>", text)
+
+
 @pytest.mark.slow
 def test_teams_play_only_active_episodes(teams):
     env = envs.make("Hopper-v5")
     chosen = np.arange(15).reshape(3, 5) % 2 == 1
     made, player = teams(), actor_and_act(env, ())
     some = only_active(native.native_rollout, env, player, chosen, horizon=20).mask.any(1)
-    assert (some.tolist(), {kernel.lanes for kernel in made}) == (chosen.tolist(), {16})
+    assert (some.tolist(), {kernel.facts.lanes for kernel in made}) == (chosen.tolist(), {16})
 
 
 @pytest.mark.slow
@@ -72,5 +87,5 @@ def test_teams_step_environments_side_by_side(teams):
         found.append(vec.reset(jax.random.key(0)))
         for _ in range(4):
             found[-1] = vec.step(found[-1], action)
-    assert {kernel.lanes for kernel in made} == {16}
+    assert {kernel.facts.lanes for kernel in made} == {16}
     np.testing.assert_allclose(*[state.obs for state in found], rtol=2e-3, atol=2e-3)

@@ -1,6 +1,6 @@
-// The teams of a block on a GPU. Its warps are in groups, and a group begins each step of the physics
-// together, so that it fetches the step's code, which is larger than the caches near a scheduler,
-// once. With one group all would wait for memory at the same time.
+// The teams of a block on a GPU. Its warps are in groups, and a group begins each step of the
+// physics together, so that it fetches the step's code, which is larger than the caches near a
+// scheduler, once. With one group all would wait for memory at the same time.
 #pragma once
 #ifdef __CUDACC__
 constexpr int GROUPS = 2, WHOLE = 32 / W;

@@ -4,7 +4,7 @@
 
 // The contact of an item, if its distance is below the margin.
 DEV Touch touch_of(const Model& M, const State& s, int item, real margin) {
-  const int a = M.item[item] & 0xfff, b = M.item[item] >> 12 & 0xfff, part = M.item[item] >> 24 & 7;
+  const int a = M.item[item].first(), b = M.item[item].second(), part = M.item[item].part();
   Touch c;
   for (int k = 0; k < 3; k++) c.tangent[k] = 0;
   const int below = M.geom_kind[a], above = M.geom_kind[b];
@@ -53,51 +53,55 @@ DEV Contact contact_of(const Model& M, const State& s, int item, const Touch& to
   for (int k = 0; k < 3; k++) c.at[k] = touch.at[k] - s.pose[0].origin(k);
   const int kind = M.item_kind[item];
   const real distance = touch.distance - M.kind_margin[kind];
-  const real *soft = M.soft + 7 * M.kind_soft[kind], strength = impedance(soft, distance);
+  const Softness& soft = M.soft[M.kind_soft[kind]];
+  const real strength = impedance(soft, distance);
   c.item = item;
-  c.mass = row_mass(strength, M.item_weight[item]);
+  c.constraint_mass = constraint_mass(strength, M.item_weight[item]);
   real speed[CD];
   relative(M, s.velocity, c, speed);
-  relative(M, s.motion, c, c.gap);
-  for (int k = 0; k < CD; k++) c.gap[k] += soft[1] * speed[k];
-  c.gap[0] += soft[0] * strength * distance;
+  relative(M, s.motion, c, c.residual);
+  for (int k = 0; k < CD; k++) c.residual[k] += soft.damping * speed[k];
+  c.residual[0] += soft.stiffness * strength * distance;
   return c;
 }
 
 DEV void collide(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
-  int waiting = 0, made = 0;
+  int waiting = 0, num_contacts = 0;
   LOOP for (int first = 0; first < NI; first += W) {
     const int item = first + lane;
     bool near = false;
     if (item < NI) {
-      const int a = M.item[item] & 0xfff, b = M.item[item] >> 12 & 0xfff;
+      const int a = M.item[item].first(), b = M.item[item].second();
       const Quad p = s.geom_place[a], q = s.geom_place[b];
       const real d[3] = {q.x[0] - p.x[0], q.x[1] - p.x[1], q.x[2] - p.x[2]};
       const real reach = p.x[3] + q.x[3] + M.kind_margin[M.item_kind[item]];
       near = M.geom_kind[a] == PLANE ? dot(d, s.geom_axis[a].x) < reach : dot(d, d) < reach * reach;
     }
-    const unsigned who = t.ballot(near);
-    if (near) s.queue[waiting + count(who & ((1u << lane) - 1))] = item;
-    waiting += count(who);
+    const unsigned near_lanes = t.ballot(near);
+    // A near item's place in the queue is how many lanes before this one have one.
+    if (near) s.queue[waiting + count(near_lanes & ((1u << lane) - 1))] = item;
+    waiting += count(near_lanes);
     const bool last = first + W >= NI;
+    // Items near by their bounding spheres are few. Only a queue that is full is looked at closely,
+    // so that all lanes have one; what is left over, after the last items.
     LOOP while (waiting >= W || (last && waiting > 0)) {
       t.sync();
-      const bool asked = lane < waiting;
-      const int which = s.queue[lane];
+      const bool has_item = lane < waiting;
+      const int queued_item = s.queue[lane];
       bool touches = false;
       Touch touch;
-      if (asked) {
-        const real margin = M.kind_margin[M.item_kind[which]];
-        touch = touch_of(M, s, which, margin);
+      if (has_item) {
+        const real margin = M.kind_margin[M.item_kind[queued_item]];
+        touch = touch_of(M, s, queued_item, margin);
         touches = touch.distance < margin;
       }
-      const unsigned which_touch = t.ballot(touches);
+      const unsigned touching_lanes = t.ballot(touches);
       if (touches) {
-        const int at = made + count(which_touch & ((1u << lane) - 1));
-        (!FAR || at < NEAR ? s.contacts[at] : s.far[at - NEAR]) = contact_of(M, s, which, touch);
+        const int at = num_contacts + count(touching_lanes & ((1u << lane) - 1));
+        contact_at(s, at) = contact_of(M, s, queued_item, touch);
       }
-      made += count(which_touch);
+      num_contacts += count(touching_lanes);
       const int next = s.queue[W + lane];
       t.sync();
       waiting -= W;
@@ -105,6 +109,6 @@ DEV void collide(const Team& t, const Model& M, State& s) {
     }
     if (waiting < 0) waiting = 0;
   }
-  if (lane == 0) s.num_contacts = made;
+  if (lane == 0) s.num_contacts = num_contacts;
   t.sync();
 }

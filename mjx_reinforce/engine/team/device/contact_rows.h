@@ -4,8 +4,8 @@
 // How the second body of a contact moves at the contact, as the first one sees it, in the contact's
 // frame (mj_jacDifPair times a velocity). of: spatial velocities of links.
 DEV void relative(const Model& M, const real (*of)[6], const Contact& c, real* out) {
-  const int item = M.item[c.item];
-  const real *first = of[M.geom_link[item & 0xfff]], *second = of[M.geom_link[item >> 12 & 0xfff]];
+  const Item item = M.item[c.item];
+  const real *first = of[M.geom_link[item.first()]], *second = of[M.geom_link[item.second()]];
   real v[6], point[3];
   for (int k = 0; k < 6; k++) v[k] = second[k] - first[k];
   cross(point, v, c.at);
@@ -14,9 +14,9 @@ DEV void relative(const Model& M, const real (*of)[6], const Contact& c, real* o
 }
 // The entries of the basis of a contact that degree of freedom i has.
 DEV void basis(const Model& M, const State& s, const Contact& c, int i, real* out) {
-  const int item = M.item[c.item];
-  const Mask first = M.link_dofs[M.geom_link[item & 0xfff]];
-  const Mask second = M.link_dofs[M.geom_link[item >> 12 & 0xfff]];
+  const Item item = M.item[c.item];
+  const Mask first = M.link_dofs[M.geom_link[item.first()]];
+  const Mask second = M.link_dofs[M.geom_link[item.second()]];
   const real sign = real(int(second >> i & 1) - int(first >> i & 1));
   const Quad a = s.cdof[i][0], b = s.cdof[i][1];
   real point[3];
@@ -34,7 +34,7 @@ template <class F> DEV void each_edge(const Model& M, const Contact& c, F do_edg
   if (dim == 1) do_edge(real(0), 0, real(1));
   UNROLL for (int k = 1; k < CD; k++) {
     if (k < dim) {
-      const real friction = M.kind_friction[5 * kind + k - 1];
+      const real friction = M.kind_friction[kind].along[k - 1];
       do_edge(friction, k, real(1));
       do_edge(-friction, k, real(-1));
     }
@@ -45,14 +45,15 @@ DEV void push(const Model& M, Contact& c) {
   for (int k = 0; k < CD; k++) c.force[k] = 0;
   for (int k = 0; k < 2 * CD - 1; k++) c.stiffness[k] = 0;
   each_edge(M, c, [&](real friction, int k, real) {
-    const real gap = c.gap[0] + friction * c.gap[k], mass = gap < 0 ? c.mass : real(0);
-    const real force = -mass * gap;
+    const real residual = c.residual[0] + friction * c.residual[k];
+    const real active_mass = residual < 0 ? c.constraint_mass : real(0);
+    const real force = -active_mass * residual;
     c.force[0] += force;
-    c.stiffness[0] += mass;
+    c.stiffness[0] += active_mass;
     if (k > 0) {
       c.force[k] += friction * force;
-      c.stiffness[k] += friction * mass;
-      c.stiffness[CD - 1 + k] += friction * friction * mass;
+      c.stiffness[k] += friction * active_mass;
+      c.stiffness[CD - 1 + k] += friction * friction * active_mass;
     }
   });
 }
@@ -60,31 +61,36 @@ DEV void push(const Model& M, Contact& c) {
 // What a contact's edges add to the derivative of the cost at a length along the step (PrimalEval).
 DEV void bend(const Model& M, const Contact& c, real length, Bend& sum) {
   each_edge(M, c, [&](real friction, int k, real) {
-    const real gap = c.gap[0] + (k ? friction * c.gap[k] : real(0));
+    const real residual = c.residual[0] + (k ? friction * c.residual[k] : real(0));
     const real change = c.change[0] + (k ? friction * c.change[k] : real(0));
-    sum.add(c.mass, gap, change, length);
+    sum.add(c.constraint_mass, residual, change, length);
   });
 }
 
+// A contact by its number: the first are in the state, others in memory.
+DEV Contact& contact_at(State& s, int number) {
+  return !FAR || number < NEAR ? s.contacts[number] : s.far[number - NEAR];
+}
 // Each contact once, by the lane whose it is.
 template <class F> DEV void each_contact(const Team& t, State& s, F act) {
-  const int lane = t.lane, made = s.num_contacts;
-  EACH(c, made) act(!FAR || c < NEAR ? s.contacts[c] : s.far[c - NEAR]);
+  const int lane = t.lane, num_contacts = s.num_contacts;
+  EACH(number, num_contacts) act(contact_at(s, number));
 }
 // All contacts, by all lanes together.
 template <class F> DEV void all_contacts(const Team& t, State& s, F act) {
-  const int made = s.num_contacts;
-  LOOP for (int c = 0; c < made; c++) {
-    const Contact* one = s.contacts + c;
+  const int num_contacts = s.num_contacts;
+  LOOP for (int c = 0; c < num_contacts; c++) {
+    const Contact* contact = s.contacts + c;
     if (FAR && c >= NEAR) {
+      // Copied by all lanes, a word each: memory is far, and all of them read all of the contact.
       t.sync();
       char* to = reinterpret_cast<char*>(&s.guest);
       const char* from = reinterpret_cast<const char*>(s.far + (c - NEAR));
       for (int k = 4 * t.lane; k < int(sizeof(Contact)); k += 4 * W)
         memcpy(to + k, __builtin_assume_aligned(from + k, 4), 4);
       t.sync();
-      one = &s.guest;
+      contact = &s.guest;
     }
-    act(*one);
+    act(*contact);
   }
 }

@@ -19,20 +19,21 @@ DEV void actuate(const Team& t, const Model& M, State& s) {
   EACH(i, NV) {
     real force = 0, drag = M.dof_damping[i];
     LOOP for (int a = M.dof_actuator[i]; a < M.dof_actuator[i + 1]; a++) {
-      // gear; control low, high; gain; bias [3]; force low, high; gain by length and speed
-      const real* p = M.actuator + 11 * a;
-      const real gear = p[0], length = gear * s.qpos[M.dof_qpos[i]], speed = gear * s.qvel[i];
-      const real given = clip(s.ctrl[M.actuator_ctrl[a]], p[1], p[2]);
-      const real gain = p[3] + p[9] * length + p[10] * speed;
-      const real pushed = gain * given + p[4] + p[5] * length + p[6] * speed;
-      force += gear * clip(pushed, p[7], p[8]);
-      if (IMPLICIT == 2 && pushed > p[7] && pushed < p[8])
-        drag -= gear * gear * (p[6] + p[10] * given);
+      const Actuator& p = M.actuator[a];
+      const real length = p.gear * s.qpos[M.dof_qpos[i]], speed = p.gear * s.qvel[i];
+      const real control = clip(s.ctrl[M.actuator_ctrl[a]], p.control_low, p.control_high);
+      const real gain = p.gain + p.gain_by_length * length + p.gain_by_speed * speed;
+      const real push =
+          gain * control + p.bias + p.bias_by_length * length + p.bias_by_speed * speed;
+      force += p.gear * clip(push, p.force_low, p.force_high);
+      // A force at its bound does not change with the speed: it damps nothing.
+      if (IMPLICIT == 2 && push > p.force_low && push < p.force_high)
+        drag -= p.gear * p.gear * (p.bias_by_speed + p.gain_by_speed * control);
     }
-    const real low = M.dof_force[2 * i], high = M.dof_force[2 * i + 1];
-    const bool bounded = IMPLICIT == 1 || force <= low || force >= high;
+    const Range range = M.dof_force[i];
+    const bool bounded = IMPLICIT == 1 || force <= range.low || force >= range.high;
     if (IMPLICIT) s.drag[i] = bounded ? M.dof_damping[i] : drag;
-    s.qfrc_actuator[i] = clip(force, low, high);
+    s.qfrc_actuator[i] = clip(force, range.low, range.high);
   }
 }
 
@@ -64,8 +65,9 @@ DEV void motions(const Team& t, const Model& M, State& s) {
   t.sync();
 }
 
-// Leaves M below the diagonal of s.rows (mj_crb), and M x - qfrc_smooth in s.pull (the way back of
-// mj_rne, mj_passive).
+// Leaves M below the diagonal of s.rows (mj_crb), and M x - qfrc_smooth in s.imbalance (the way
+// back of mj_rne, mj_passive), where x is qacc_warmstart: the force that x takes is found with that
+// of qvel, without a product of M.
 DEV void forces_and_inertia(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
   real(*whole)[20] = reinterpret_cast<real(*)[20]>(&s.subtree[0][0].x[0]);
@@ -80,6 +82,8 @@ DEV void forces_and_inertia(const Team& t, const Model& M, State& s) {
     for (int k = 0; k < 6; k++) whole[l][10 + k] = force[k] + a[k];
   }
   t.sync();
+  // From the leaves to the root: each link's inertia and force become those of its subtree. A lane
+  // has one of their 16 numbers, and the tree is written out.
   EACH(k, 16) {
     real sum[NL];
     UNROLL for (int l = 0; l < NL; l++) sum[l] = whole[l][k];
@@ -89,6 +93,7 @@ DEV void forces_and_inertia(const Team& t, const Model& M, State& s) {
       if (has_children(l)) whole[l][k] = sum[l];
   }
   t.sync();
+  // The diagonal waits in registers: s.rows lies where the subtrees are, which are still read.
   real diagonal[(NV + W - 1) / W];
   UNROLL for (int n = 0; n < (NV + W - 1) / W; n++) {
     const int i = lane + n * W;
@@ -105,9 +110,10 @@ DEV void forces_and_inertia(const Team& t, const Model& M, State& s) {
     s.terms[i][1] = {f[4], f[5], 0, 0};
     const real armature = M.dof_armature[i];
     diagonal[n] = dot6(f, moves) + armature;
-    real pull = dot6(force, moves) + armature * s.qacc_warmstart[i] + M.dof_damping[i] * s.qvel[i];
-    pull += M.dof_stiffness[i] * (s.qpos[M.dof_qpos[i]] - M.dof_spring[i]);
-    s.pull[i] = pull - s.qfrc_actuator[i];
+    real imbalance =
+        dot6(force, moves) + armature * s.qacc_warmstart[i] + M.dof_damping[i] * s.qvel[i];
+    imbalance += M.dof_stiffness[i] * (s.qpos[M.dof_qpos[i]] - M.dof_spring[i]);
+    s.imbalance[i] = imbalance - s.qfrc_actuator[i];
   }
   t.sync();
   EACH(n, SIDE * QUADS) (&s.rows[0][0])[n] = {0, 0, 0, 0};
@@ -119,7 +125,7 @@ DEV void forces_and_inertia(const Team& t, const Model& M, State& s) {
   }
   if (NV % 2 && lane == 0) rows[NV * (STRIDE + 1)] = 1;
   EACH(n, NPAIRED) {  // an entry below the diagonal that is not zero
-    const int i = M.paired[n] >> 16, j = M.paired[n] & 0xffff;
+    const int i = M.paired[n].high(), j = M.paired[n].low();
     const Quad a = s.terms[i][0], b = s.cdof[j][0], c = s.terms[i][1], d = s.cdof[j][1];
     rows[i * STRIDE + j] = a.x[0] * b.x[0] + a.x[1] * b.x[1] + a.x[2] * b.x[2] +
                            (a.x[3] * b.x[3] + c.x[0] * d.x[0] + c.x[1] * d.x[1]);

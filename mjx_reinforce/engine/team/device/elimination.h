@@ -2,10 +2,11 @@
 #pragma once
 
 // Solves H p = right (MuJoCo factors H, mju_cholFactor) by elimination of two columns at a time,
-// for the rows h and, as one row more, the right side. Leaves p in p and in s.step.
+// for the rows h and, as one row more, the right side. Leaves p in p and in s.direction.
 DEV void solve(const Team& t, State& s, real (&h)[ROWS_A_LANE][SIDE], real (&p)[ROWS_A_LANE]) {
   real* flat = &s.rows[0][0].x[0];
   UNROLL for (int m = 0; m < SIDE; m += 2) {
+    // Columns m and m + 1 by all lanes, in one of two buffers by turns: one sync a pair of columns.
     real *first = &s.columns[m / 2 % 2][0][0].x[0], *second = &s.columns[m / 2 % 2][1][0].x[0];
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
       const int i = t.lane + r * W;
@@ -36,6 +37,8 @@ DEV void solve(const Team& t, State& s, real (&h)[ROWS_A_LANE][SIDE], real (&p)[
         }
     }
   }
+  // The multipliers are above the diagonal, and those of the right side are a column behind it:
+  // from the last rows on, each row's solution is subtracted from the rows before it.
   t.sync();
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
     const int i = t.lane + r * W;
@@ -57,7 +60,7 @@ DEV void solve(const Team& t, State& s, real (&h)[ROWS_A_LANE][SIDE], real (&p)[
   }
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
     const int i = t.lane + r * W;
-    if (i < SIDE) s.step[i / 4].x[i % 4] = p[r];
+    if (i < SIDE) s.direction[i / 4].x[i % 4] = p[r];
   }
   t.sync();
 }

@@ -5,7 +5,7 @@
 DEV void connect_rows(const Team& t, const Model& M, State& s, int n) {
   const int lane = t.lane;
   const int link[2] = {M.connect_link[2 * n], M.connect_link[2 * n + 1]};
-  const real* soft = M.soft + 7 * M.connect_soft[n];
+  const Softness& soft = M.soft[M.connect_soft[n]];
   real arm[2][3], apart[3];
   for (int side = 0; side < 2; side++) {
     s.pose[link[side]].place(arm[side], M.connect_at + 6 * n + 3 * side);
@@ -24,7 +24,7 @@ DEV void connect_rows(const Team& t, const Model& M, State& s, int n) {
     for (int k = 0; k < 3; k++) s.general[3 * n + k][i / 4].x[i % 4] = sum[k];
   }
   EACH(k, 3) {
-    real wanted = 0;
+    real residual = 0;
     for (int side = 0; side < 2; side++) {
       const int l = link[side];
       if (l == NL) continue;
@@ -37,11 +37,11 @@ DEV void connect_rows(const Team& t, const Model& M, State& s, int n) {
       cross(by_qvel, a, arm[side]);
       cross(by_x, x, arm[side]);
       const real point = by_qvel[k] + a[3 + k] + turned[k] + by_x[k] + x[3 + k];
-      wanted += (side ? -1 : 1) * (point + soft[1] * speed[k]);
+      residual += (side ? -1 : 1) * (point + soft.damping * speed[k]);
     }
     const real strength = impedance(soft, root(dot(apart, apart)));
-    s.general_mass[3 * n + k] = row_mass(strength, M.connect_weight[n]);
-    s.general_gap[3 * n + k] = wanted + soft[0] * strength * apart[k];
+    s.general_constraint_mass[3 * n + k] = constraint_mass(strength, M.connect_weight[n]);
+    s.general_residual[3 * n + k] = residual + soft.stiffness * strength * apart[k];
   }
 }
 
@@ -49,21 +49,22 @@ DEV void joint_rows(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
   EACH(n, NE - 3 * NCONNECT) {
     const int e = 3 * NCONNECT + n, first = M.joined_dof[2 * n], second = M.joined_dof[2 * n + 1];
-    const real *p = M.joined_poly + 5 * n, *soft = M.soft + 7 * M.joined_soft[n];
+    const real* p = M.joined_poly + 5 * n;
+    const Softness& soft = M.soft[M.joined_soft[n]];
     for (int q = 0; q < QUADS; q++) s.general[e][q] = {0, 0, 0, 0};
     real off = s.qpos[M.dof_qpos[first]] - M.dof_zero[first] - p[0];
-    real moves = s.qacc_warmstart[first] + soft[1] * s.qvel[first];
+    real moves = s.qacc_warmstart[first] + soft.damping * s.qvel[first];
     s.general[e][first / 4].x[first % 4] = 1;
     if (second >= 0) {
       const real q = s.qpos[M.dof_qpos[second]] - M.dof_zero[second];
       const real slope = p[1] + q * (2 * p[2] + q * (3 * p[3] + q * 4 * p[4]));
       off -= q * (p[1] + q * (p[2] + q * (p[3] + q * p[4])));
-      moves -= slope * (s.qacc_warmstart[second] + soft[1] * s.qvel[second]);
+      moves -= slope * (s.qacc_warmstart[second] + soft.damping * s.qvel[second]);
       s.general[e][second / 4].x[second % 4] = -slope;
     }
     const real strength = impedance(soft, off);
-    s.general_mass[e] = row_mass(strength, M.joined_weight[n]);
-    s.general_gap[e] = moves + soft[0] * strength * off;
+    s.general_constraint_mass[e] = constraint_mass(strength, M.joined_weight[n]);
+    s.general_residual[e] = moves + soft.stiffness * strength * off;
   }
 }
 

@@ -5,9 +5,9 @@
 constexpr int STAGES = RK4 ? 4 : 1;
 
 // The acceleration, in s.qacc_warmstart (mj_forward). Returns the Newton steps.
-DEV int forward(const Team& given, const Model& M, State& s) {
-  given.meet();
-  const Team t = given.anew();
+DEV int forward(const Team& team, const Model& M, State& s) {
+  team.meet();
+  const Team t = team.anew();
   place_links(t, M, s);
   place_dofs(t, M, s);
   place_inertias(t, M, s);
@@ -70,7 +70,7 @@ DEV void rotation_rate(real* rate, const real* rotation, const real* velocity) {
 // mj_RungeKutta of order 4; the rates are those of qpos, rotation vectors of the start included.
 DEV void runge_kutta(const Team& t, const Model& M, State& s, bool last) {
   const int lane = t.lane;
-  real* rates = &s.step[0].x[0];
+  real* rates = &s.direction[0].x[0];
   EACH(i, NQ) s.start_qpos[i] = s.qpos[i];
   EACH(i, NV) {
     s.start_qvel[i] = s.qvel[i];
@@ -108,7 +108,7 @@ DEV void runge_kutta(const Team& t, const Model& M, State& s, bool last) {
 DEV void euler(const Team& t, const Model& M, State& s, bool last) {
   const int lane = t.lane;
   forward(t, M, s);
-  const real* more = &s.step[0].x[0];
+  const real* more = &s.direction[0].x[0];
   EACH(i, NV) s.qvel[i] += M.timestep * (s.qacc_warmstart[i] + (IMPLICIT ? more[i] : real(0)));
   t.sync();
   if (last) report(t, M, s);
@@ -141,8 +141,8 @@ DEV bool physics(const Team& t, const Model& M, State& s, int skip) {
   return sound;
 }
 
-// What a task reads of the state that s.qpos and s.qvel are at, before any step: MuJoCo's mj_forward,
-// which leaves cfrc_ext zero.
+// What a task reads of the state that s.qpos and s.qvel are at, before any step: MuJoCo's
+// mj_forward, which leaves cfrc_ext zero.
 DEV void start(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
   EACH(k, 12) s.pose[NL].row[k / 4].x[k % 4] = k % 5 == 0;

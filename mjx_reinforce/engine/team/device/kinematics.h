@@ -15,9 +15,9 @@ DEV Pose pose_in_parent(const Model& M, const State& s, int l) {
   for (int k = 0; k < 4; k++) turn[k] = first[k];
   for (int k = 0; k < 3; k++) at[k] = M.link_at[3 * l + k];
   if (NTURN && kind <= BALL) {
-    const real* own = kind == FREE ? q + 3 : q;
+    const real* quat = kind == FREE ? q + 3 : q;
     real unit[4];
-    for (int k = 0; k < 4; k++) unit[k] = own[k];
+    for (int k = 0; k < 4; k++) unit[k] = quat[k];
     to_unit(unit);
     if (kind == FREE) {
       for (int k = 0; k < 3; k++) at[k] = q[k];
@@ -52,18 +52,18 @@ DEV void place_links(const Team& t, const Model& M, State& s) {
     UNROLL for (int n = 0; n < MOST; n++) {
       const int e = lane + n * W;
       if (n * W < jumps && e < jumps) {
-        const int jump = M.jump[first + e];
-        const Quad far = flat[jump >> 16];
-        const Pose& own = s.pose[(jump & 0xffff) / 3];
+        const Pair jump = M.jump[first + e];
+        const Quad far = flat[jump.high()];
+        const Pose& pose = s.pose[jump.low() / 3];
         for (int k = 0; k < 4; k++)
-          joined[n].x[k] = far.x[0] * own.row[0].x[k] + far.x[1] * own.row[1].x[k] +
-                           far.x[2] * own.row[2].x[k] + (k == 3 ? far.x[3] : real(0));
+          joined[n].x[k] = far.x[0] * pose.row[0].x[k] + far.x[1] * pose.row[1].x[k] +
+                           far.x[2] * pose.row[2].x[k] + (k == 3 ? far.x[3] : real(0));
       }
     }
     t.sync();
     UNROLL for (int n = 0; n < MOST; n++) {
       const int e = lane + n * W;
-      if (n * W < jumps && e < jumps) s.pose[0].row[M.jump[first + e] & 0xffff] = joined[n];
+      if (n * W < jumps && e < jumps) s.pose[0].row[M.jump[first + e].low()] = joined[n];
     }
   }
   t.sync();
@@ -75,16 +75,16 @@ DEV void place_dofs(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
   EACH(i, NV) {
     const Pose& p = s.pose[M.dof_link[i]];
-    const real* own = M.dof_axis + 3 * i;
+    const real* local_axis = M.dof_axis + 3 * i;
     real axis[3], arm[3], moves[8] = {};
-    p.turn(axis, own);
+    p.turn(axis, local_axis);
     for (int k = 0; k < 3; k++) arm[k] = s.pose[0].origin(k) - p.origin(k);
     const int kind = M.dof_kind[i];
     if (kind == TURNS) {
       for (int k = 0; k < 3; k++) moves[k] = axis[k];
       cross(moves + 3, axis, arm);
     } else {
-      for (int k = 0; k < 3; k++) moves[3 + k] = kind == SHIFTS ? axis[k] : own[k];
+      for (int k = 0; k < 3; k++) moves[3 + k] = kind == SHIFTS ? axis[k] : local_axis[k];
     }
     s.cdof[i][0] = {moves[0], moves[1], moves[2], moves[3]};
     s.cdof[i][1] = {moves[4], moves[5], 0, 0};
@@ -95,11 +95,11 @@ DEV void place_inertias(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
   EACH(l, NL) {
     const Pose& p = s.pose[l];
-    real own[6], at[3], all[12];
-    turn_symmetric(own, p, M.link_inertia + 6 * l);
+    real inertia[6], at[3], all[12];
+    turn_symmetric(inertia, p, M.link_inertia + 6 * l);
     p.place(at, M.link_com + 3 * l);
     for (int k = 0; k < 3; k++) at[k] -= s.pose[0].origin(k);
-    spatial_inertia(all, own, M.link_mass[l], at);
+    spatial_inertia(all, inertia, M.link_mass[l], at);
     for (int q = 0; q < 2; q++)
       s.subtree[l][q] = {all[4 * q], all[4 * q + 1], all[4 * q + 2], all[4 * q + 3]};
     s.subtree[l][2].x[0] = all[8];

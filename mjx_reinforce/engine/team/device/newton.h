@@ -1,4 +1,8 @@
 // The acceleration under constraints: Newton's method with an exact line search, to the optimum.
+//
+// It minimizes what physics/newton.py says, in its letters: qacc, direction, imbalance = M qacc -
+// qfrc_smooth, residual = J qacc - reference, constraint_mass = D. The imbalance and the residuals
+// are carried from step to step, so that neither M nor J is multiplied by qacc.
 #pragma once
 
 constexpr int MOST_STEPS = SINGLE ? 20 : 100, MOST_LOOKS = 40;
@@ -6,23 +10,24 @@ constexpr int MOST_STEPS = SINGLE ? 20 : 100, MOST_LOOKS = 40;
 // optimum: the last step is always a whole one that changes no row.
 constexpr real LINE_TOLERANCE = real(.1);
 
-// A lane has the rows lane, lane + W, ... of the degrees of freedom.
+// A lane has the rows lane, lane + W, ... of the degrees of freedom. Its loops over them are
+// written out, so that what it has of each is in registers.
 struct Search {
-  real x[ROWS_A_LANE];         // the acceleration
-  real pull[ROWS_A_LANE];      // M x - qfrc_smooth
-  real diagonal[ROWS_A_LANE];  // of M
-  real gradient[ROWS_A_LANE];  // of the cost at x
-  real step[ROWS_A_LANE];
+  real qacc[ROWS_A_LANE];       // the acceleration
+  real imbalance[ROWS_A_LANE];  // M qacc - qfrc_smooth
+  real diagonal[ROWS_A_LANE];   // of M
+  real gradient[ROWS_A_LANE];   // of the cost at qacc
+  real direction[ROWS_A_LANE];  // Newton's step
   Bounds bounds[ROWS_A_LANE];
 
   DEV Search(const Team& t, const Model& M, const State& s) {
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
       const int i = t.lane + r * W;
-      x[r] = pull[r] = diagonal[r] = 0;
+      qacc[r] = imbalance[r] = diagonal[r] = 0;
       bounds[r] = Bounds();
       if (i < NV) {
-        x[r] = s.qacc_warmstart[i];
-        pull[r] = s.pull[i];
+        qacc[r] = s.qacc_warmstart[i];
+        imbalance[r] = s.imbalance[i];
         diagonal[r] = s.rows[i][i / 4].x[i % 4];
         bounds[r].make(M, s, i);
       }
@@ -33,19 +38,19 @@ struct Search {
 // Writes the diagonal of H and begins the gradient: all but contacts and general rows. Where
 // damping is implicit and the acceleration has been found, H is M plus the damping, and no row is
 // left.
-DEV void begin_step(const Team& t, const Model& M, State& s, Search& own, bool damps) {
+DEV void begin_step(const Team& t, const Model& M, State& s, Search& search, bool damps) {
   real* flat = &s.rows[0][0].x[0];
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
     const int i = t.lane + r * W;
     real stiffness = 0;
-    own.gradient[r] = own.pull[r];
+    search.gradient[r] = search.imbalance[r];
     if (damps) {
       stiffness = i < NV ? M.timestep * s.drag[i] : real(0);
-      own.gradient[r] = stiffness * own.x[r];
+      search.gradient[r] = stiffness * search.qacc[r];
     } else {
-      own.bounds[r].push(own.x[r], own.gradient[r], stiffness);
+      search.bounds[r].push(search.qacc[r], search.gradient[r], stiffness);
     }
-    if (i < NV) flat[i * (STRIDE + 1)] = own.diagonal[r] + stiffness;
+    if (i < NV) flat[i * (STRIDE + 1)] = search.diagonal[r] + stiffness;
   }
 }
 DEV void load_rows(const Team& t, const State& s, real (&h)[ROWS_A_LANE][SIDE]) {
@@ -62,20 +67,22 @@ DEV void load_rows(const Team& t, const State& s, real (&h)[ROWS_A_LANE][SIDE]) 
 // gradient.
 DEV void add_rows(const Team& t, const Model& M, State& s, real (&h)[ROWS_A_LANE][SIDE],
                   real (&gradient)[ROWS_A_LANE]) {
+  // Two buffers by turns: a lane that is ahead writes the next contact's entries while others still
+  // read this one's, and one sync a contact is enough.
   int turn = 0;
   all_contacts(t, s, [&](const Contact& c) {
     if (c.stiffness[0] == 0) return;
     Quad(*const rows)[QUADS] = s.columns[turn];
     turn ^= 1;
-    real own[ROWS_A_LANE][CD];
+    real entries[ROWS_A_LANE][CD];
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
       const int i = t.lane + r * W;
-      for (int k = 0; k < CD; k++) own[r][k] = 0;
+      for (int k = 0; k < CD; k++) entries[r][k] = 0;
       if (i < NV) {
-        basis(M, s, c, i, own[r]);
+        basis(M, s, c, i, entries[r]);
         for (int k = 0; k < CD; k++) {
-          rows[k][i / 4].x[i % 4] = own[r][k];
-          gradient[r] -= own[r][k] * c.force[k];
+          rows[k][i / 4].x[i % 4] = entries[r][k];
+          gradient[r] -= entries[r][k] * c.force[k];
         }
       } else if (i < SIDE) {
         for (int k = 0; k < CD; k++) rows[k][i / 4].x[i % 4] = 0;
@@ -83,12 +90,14 @@ DEV void add_rows(const Team& t, const Model& M, State& s, real (&h)[ROWS_A_LANE
     }
     const int dim = M.kind_dim[M.item_kind[c.item]];
     t.sync();
+    // J' stiffness J, where stiffness has a first row and column and a diagonal: the edges of the
+    // pyramid couple the normal with each tangent, and no tangent with another one.
     real weight[ROWS_A_LANE][CD];
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
-      weight[r][0] = c.stiffness[0] * own[r][0];
+      weight[r][0] = c.stiffness[0] * entries[r][0];
       for (int k = 1; k < CD; k++) {
-        weight[r][0] += c.stiffness[k] * own[r][k];
-        weight[r][k] = c.stiffness[k] * own[r][0] + c.stiffness[CD - 1 + k] * own[r][k];
+        weight[r][0] += c.stiffness[k] * entries[r][k];
+        weight[r][k] = c.stiffness[k] * entries[r][0] + c.stiffness[CD - 1 + k] * entries[r][k];
       }
     }
     UNROLL for (int k = 0; k < CD; k++) {
@@ -102,60 +111,65 @@ DEV void add_rows(const Team& t, const Model& M, State& s, real (&h)[ROWS_A_LANE
     }
   });
   LOOP for (int e = 0; e < NE; e++) {
-    const real mass = s.general_mass[e], force = -mass * s.general_gap[e];
+    const real constraint_mass = s.general_constraint_mass[e];
+    const real force = -constraint_mass * s.general_residual[e];
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
       const int i = t.lane + r * W;
-      const real own = i < SIDE ? s.general[e][i / 4].x[i % 4] : real(0);
-      gradient[r] -= own * force;
-      UNROLL for (int j = 0; j < SIDE; j++) h[r][j] += mass * own * s.general[e][j / 4].x[j % 4];
+      const real entry = i < SIDE ? s.general[e][i / 4].x[i % 4] : real(0);
+      gradient[r] -= entry * force;
+      UNROLL for (int j = 0; j < SIDE; j++)
+        h[r][j] += constraint_mass * entry * s.general[e][j / 4].x[j % 4];
     }
   }
   t.sync();
 }
 
-// Minus the gradient is the row below H, for the elimination.
-DEV void load_right_side(const Team& t, State& s, const Search& own,
+// Minus the gradient is the row below H, for the elimination, which so solves for it on the way.
+// One lane has that row, and each has a part of the gradient: it goes through memory.
+DEV void load_right_side(const Team& t, State& s, const Search& search,
                          real (&h)[ROWS_A_LANE][SIDE]) {
-  real* step = &s.step[0].x[0];
+  real* right_side = &s.direction[0].x[0];
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
     const int i = t.lane + r * W;
-    if (i < SIDE) step[i] = i < NV ? -own.gradient[r] : real(0);
+    if (i < SIDE) right_side[i] = i < NV ? -search.gradient[r] : real(0);
   }
   t.sync();
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
     if (t.lane + r * W == SIDE)
-      UNROLL for (int j = 0; j < SIDE; j++) h[r][j] = step[j];
+      UNROLL for (int j = 0; j < SIDE; j++) h[r][j] = right_side[j];
 }
 
-// How the rows change along s.step.
+// How the residuals change along s.direction. Of contacts by the velocities that the direction
+// gives to links, which is less work than by the entries of J.
 DEV void change_along(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
-  EACH(k, 6) along_tree(&s.cdof[0][0].x[0] + k, s.step, &s.motion[0][k], 6);
+  EACH(k, 6) along_tree(&s.cdof[0][0].x[0] + k, s.direction, &s.motion[0][k], 6);
   t.sync();
   each_contact(t, s, [&](Contact& c) { relative(M, s.motion, c, c.change); });
   EACH(e, NE) {
     real sum = 0;
     for (int q = 0; q < QUADS; q++)
       for (int k = 0; k < 4; k++)
-        if (4 * q + k < SIDE) sum += s.general[e][q].x[k] * s.step[q].x[k];
+        if (4 * q + k < SIDE) sum += s.general[e][q].x[k] * s.direction[q].x[k];
     s.general_change[e] = sum;
   }
 }
 
-// What this lane's rows add to the derivative of the cost at a length along the step.
-DEV Bend bend_at(const Team& t, const Model& M, State& s, const Search& own, real length) {
+// What this lane's rows add to the derivative of the cost at a length along the direction.
+DEV Bend bend_at(const Team& t, const Model& M, State& s, const Search& search, real length) {
   Bend sum = {0, 0, false};
   each_contact(t, s, [&](Contact& c) { bend(M, c, length, sum); });
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
-    own.bounds[r].bend(own.x[r], own.step[r], length, sum);
+    search.bounds[r].bend(search.qacc[r], search.direction[r], length, sum);
   return sum;
 }
 
 // How far to go along a step whose slope at the start is `along` (MuJoCo's PrimalSearch): Newton's
 // method in one dimension, or halves where that leaves the interval. With no change of rows the
 // slope is zero at length 1.
-DEV real line_search(const Team& t, const Model& M, State& s, const Search& own, Bend sum,
+DEV real line_search(const Team& t, const Model& M, State& s, const Search& search, Bend sum,
                      real along) {
+  // Length 1 was looked at before: `sum` is of there.
   real length = 1, low = 0, high = real(1e30);
   LOOP for (int look = 0; look < MOST_LOOKS; look++) {
     const real slope = (1 - length) * along + t.sum(sum.slope);
@@ -163,18 +177,21 @@ DEV real line_search(const Team& t, const Model& M, State& s, const Search& own,
     const real curvature = t.sum(sum.curvature) - along;
     if (slope < 0) low = length; else high = length;
     real next = length - slope / curvature;
+    // As long as no length with a positive slope is known, there is no middle: twice as far.
     if (!(next > low && next < high)) next = high < real(1e29) ? (low + high) / 2 : 2 * length;
     length = next;
-    sum = bend_at(t, M, s, own, length);
+    sum = bend_at(t, M, s, search, length);
   }
   return length;
 }
 
-// Adds M step to own.pull: H step is minus the gradient, so M step = -gradient - J' stiffness J
-// step.
-DEV void follow(const Team& t, const Model& M, State& s, Search& own, real length) {
+// Adds M direction to search.imbalance: H direction is minus the gradient, so M direction =
+// -gradient - J' stiffness J direction, without a product with M.
+DEV void follow(const Team& t, const Model& M, State& s, Search& search, real length) {
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
-    own.pull[r] -= length * (own.gradient[r] + own.bounds[r].stiffness(own.x[r]) * own.step[r]);
+    search.imbalance[r] -=
+        length *
+        (search.gradient[r] + search.bounds[r].stiffness(search.qacc[r]) * search.direction[r]);
   all_contacts(t, s, [&](const Contact& c) {
     if (c.stiffness[0] == 0) return;
     real force[CD];
@@ -188,7 +205,7 @@ DEV void follow(const Team& t, const Model& M, State& s, Search& own, real lengt
       real moves[CD];
       if (i < NV) {
         basis(M, s, c, i, moves);
-        for (int k = 0; k < CD; k++) own.pull[r] -= length * moves[k] * force[k];
+        for (int k = 0; k < CD; k++) search.imbalance[r] -= length * moves[k] * force[k];
       }
     }
   });
@@ -197,52 +214,56 @@ DEV void follow(const Team& t, const Model& M, State& s, Search& own, real lengt
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
       const int i = t.lane + r * W;
       if (i < NV)
-        own.pull[r] -=
-            length * s.general_mass[e] * s.general_change[e] * s.general[e][i / 4].x[i % 4];
+        search.imbalance[r] -= length * s.general_constraint_mass[e] * s.general_change[e] *
+                               s.general[e][i / 4].x[i % 4];
     }
 }
 
 // Replaces s.qacc_warmstart by the acceleration (MuJoCo's mj_solNewton); if damping is implicit,
-// s.step becomes what that adds to it. Returns the number of steps.
+// s.direction becomes what that adds to it. Returns the number of steps.
 DEV int newton(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
-  Search own(t, M, s);
+  Search search(t, M, s);
   bool settled = false;
   int steps = 0;
   LOOP for (;; steps++) {
+    // Once it is settled, another round solves for what implicit damping adds: the same
+    // elimination, so that the code of a solve, which is long, is there once.
     const bool damps = IMPLICIT && settled;
     real h[ROWS_A_LANE][SIDE];
-    begin_step(t, M, s, own, damps);
+    begin_step(t, M, s, search, damps);
     if (!damps) each_contact(t, s, [&](Contact& c) { push(M, c); });
     t.sync();
     load_rows(t, s, h);
-    if (!damps) add_rows(t, M, s, h, own.gradient);
-    load_right_side(t, s, own, h);
-    solve(t, s, h, own.step);
+    if (!damps) add_rows(t, M, s, h, search.gradient);
+    load_right_side(t, s, search, h);
+    solve(t, s, h, search.direction);
     if (damps) break;
     change_along(t, M, s);
+    // A whole step that changes no row led to the optimum: the cost was quadratic on the way.
     real length = 1;
-    const Bend sum = bend_at(t, M, s, own, length);
+    const Bend sum = bend_at(t, M, s, search, length);
     settled = !t.any(sum.some) || steps >= MOST_STEPS;
     if (!settled) {  // rows change: another step follows
       t.sync();
       real along = 0;
-      UNROLL for (int r = 0; r < ROWS_A_LANE; r++) along += own.gradient[r] * own.step[r];
+      UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
+        along += search.gradient[r] * search.direction[r];
       along = t.sum(along);
-      length = line_search(t, M, s, own, sum, along);
-      settled = -along <= M.smallest_gain;
-      follow(t, M, s, own, length);
+      length = line_search(t, M, s, search, sum, along);
+      settled = -along <= M.smallest_gain;  // in float32, what is left is rounding
+      follow(t, M, s, search, length);
     }
-    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) own.x[r] += length * own.step[r];
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) search.qacc[r] += length * search.direction[r];
     each_contact(t, s, [&](Contact& c) {
-      for (int k = 0; k < CD; k++) c.gap[k] += length * c.change[k];
+      for (int k = 0; k < CD; k++) c.residual[k] += length * c.change[k];
     });
-    EACH(e, NE) s.general_gap[e] += length * s.general_change[e];
+    EACH(e, NE) s.general_residual[e] += length * s.general_change[e];
     t.sync();
     if (settled && !IMPLICIT) break;
   }
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
-    if (lane + r * W < NV) s.qacc_warmstart[lane + r * W] = own.x[r];
+    if (lane + r * W < NV) s.qacc_warmstart[lane + r * W] = search.qacc[r];
   t.sync();
   return steps + 1;
 }

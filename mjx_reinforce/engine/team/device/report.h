@@ -19,10 +19,12 @@ DEV void external_forces(const Team& t, const Model& M, State& s) {
   EACH(n, 6 * NB) s.cfrc_ext[n] = 0;
   each_contact(t, s, [&](Contact& c) { push(M, c); });
   t.sync();
+  // All lanes go through all contacts, and each adds those of its bodies: in one order, so that
+  // sums are the same for any number of lanes, and without atomic additions.
   all_contacts(t, s, [&](const Contact& c) {
     if (c.force[0] == 0) return;
-    const int first = M.geom_body[M.item[c.item] & 0xfff];
-    const int second = M.geom_body[M.item[c.item] >> 12 & 0xfff];
+    const int first = M.geom_body[M.item[c.item].first()];
+    const int second = M.geom_body[M.item[c.item].second()];
     EACH(b, NB) {
       if (b == 0 || (b != first && b != second)) continue;
       real force[3] = {}, torque[3] = {};
@@ -35,7 +37,8 @@ DEV void external_forces(const Team& t, const Model& M, State& s) {
   for (int n = 0; n < NCONNECT; n++) {
     real force[3];
     const real none[3] = {};
-    for (int k = 0; k < 3; k++) force[k] = -s.general_mass[3 * n + k] * s.general_gap[3 * n + k];
+    for (int k = 0; k < 3; k++)
+      force[k] = -s.general_constraint_mass[3 * n + k] * s.general_residual[3 * n + k];
     for (int side = 0; side < 2; side++) {
       const int b = M.connect_body[2 * n + side];
       real at[3];
@@ -74,10 +77,10 @@ DEV void report(const Team& t, const Model& M, State& s) {
     real com[3], arm[3], shift[3];
     center_of_tree(M, s, b, com);
     if (reports(CINERT)) {
-      real own[6];
+      real inertia[6];
       for (int k = 0; k < 3; k++) arm[k] = s.xipos[3 * b + k] - com[k];
-      turn_symmetric(own, s.pose[link], M.body_inertia + 6 * b);
-      spatial_inertia(s.cinert + 10 * b, own, M.body_mass[b], arm);
+      turn_symmetric(inertia, s.pose[link], M.body_inertia + 6 * b);
+      spatial_inertia(s.cinert + 10 * b, inertia, M.body_mass[b], arm);
     }
     for (int k = 0; k < 3; k++) arm[k] = com[k] - s.pose[0].origin(k);
     if (reports(CVEL)) {

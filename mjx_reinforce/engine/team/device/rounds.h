@@ -1,5 +1,4 @@
-// Contacts of spheres, capsules and planes. An item is a part of a pair of geoms that makes one
-// contact at most: an end of a capsule, a corner of a box.
+// Contacts of spheres, capsules and planes.
 #pragma once
 
 enum { PLANE, ROUND, BOX };  // geoms; round are spheres and capsules
@@ -20,8 +19,8 @@ DEV void closest(const Quad& p, const Quad& a, real half_a, const Quad& q, const
   const real both = dot(a.x, b.x), x = dot(a.x, d), y = dot(b.x, d), square = 1 - both * both;
   if (square * half_a * half_a * half_b * half_b < PARALLEL) {
     // Parallel (or a sphere): the middle of where they are side by side.
-    const real one = clip(both * half_b - x, -half_a, half_a);
-    on_a = (one + clip(-both * half_b - x, -half_a, half_a)) / 2;
+    const real end = clip(both * half_b - x, -half_a, half_a);
+    on_a = (end + clip(-both * half_b - x, -half_a, half_a)) / 2;
     on_b = clip(both * on_a + y, -half_b, half_b);
     return;
   }

@@ -38,10 +38,10 @@ DEV int right_signed(int x, int by) { return x >> (unsigned(by) < 32 ? by : 31);
 DEV float tanh_of(float x) { return tanhf(x); }
 DEV double tanh_of(double x) { return tanh(x); }
 
-// made[u] = bias[u] + x . kernel[:, u], a unit a lane; the sum is in two chains, in order.
+// out[u] = bias[u] + x . kernel[:, u], a unit a lane; the sum is in two chains, in order.
 template <bool TANH, class T, class P>
 DEV void layer(const Team& t, const T* x, const P* kernel, const P* bias, int inputs, int units,
-               T* made) {
+               T* out) {
   for (int u = t.lane; u < units; u += W) {
     T even = bias[u], odd = 0;
     int i = 0;
@@ -50,6 +50,6 @@ DEV void layer(const Team& t, const T* x, const P* kernel, const P* bias, int in
       odd += x[i + 1] * kernel[(i + 1) * units + u];
     }
     if (i < inputs) even += x[i] * kernel[i * units + u];
-    made[u] = TANH ? tanh_of(even + odd) : even + odd;
+    out[u] = TANH ? tanh_of(even + odd) : even + odd;
   }
 }

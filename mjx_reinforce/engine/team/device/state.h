@@ -1,5 +1,19 @@
 // What a team has of its episode, in shared memory on a GPU. What is needed at different times of a
-// step shares its place.
+// step shares its place, in the three unions of State:
+//
+//   phase               rows | subtree | reports     contacts | terms     columns | geom_*
+//   place_inertias      subtree: inertias            .                    .
+//   place_geoms         |                            .                    geom_place, geom_axis
+//   motions             subtree: + accelerations     terms: of cdof       |
+//   general_rows        | (reads accelerations)      .                    |
+//   forces_and_inertia  subtree: + forces; then      terms: inertia       |
+//                       rows: M                        times cdof         |
+//   collide             |                            contacts             | (reads geoms)
+//   newton              rows: M, elimination         |                    columns: of J, of H
+//   report              xpos to cfrc_ext             | (reads contacts)   .
+//
+// A bar is what stays from above, a point is a place that nothing needs. A task reads the reports
+// until the next step begins.
 #pragma once
 
 DEV constexpr int padded(int n) { return n < 1 ? 4 : (n + 3) / 4 * 4; }
@@ -26,11 +40,11 @@ DEV constexpr int room(int fields, int numbers) { return reports(fields) ? numbe
 struct Contact {
   real at[3];               // from the point of reference (m)
   real frame[9];            // normal, two tangents
-  real gap[CD];             // J x - reference
-  real change[CD];          // J step
+  real residual[CD];        // J qacc - reference
+  real change[CD];          // J direction
   real force[CD];           // of the edges that push
   real stiffness[2 * CD - 1];  // of the same: normal, each tangent with the normal, with itself
-  real mass;                // MuJoCo's D
+  real constraint_mass;     // MuJoCo's D
   int item;
 };
 
@@ -39,15 +53,16 @@ struct alignas(4 * sizeof(real)) State {
   real qfrc_actuator[padded(NV)], ctrl[padded(NU)], act[1], time[1];
   Quad cdof[NV][2];
   Pose pose[NL + 1];        // of links; the last is the world
-  Quad step[QUADS];
+  Quad direction[QUADS];    // of a Newton step
   real velocity[NL + 1][6]; // of links, by qvel
   real motion[NL + 1][6];   // of links, by an acceleration or by a step of it
-  real pull[NV];            // M x - qfrc_smooth
+  real imbalance[NV];       // M qacc - qfrc_smooth
   real drag[IMPLICIT ? NV : 1];  // what damps implicitly
   real start_qpos[RK4 ? NQ : 1], start_qvel[RK4 ? NV : 1];
   real sum_qvel[RK4 ? NV : 1], sum_qacc[RK4 ? NV : 1], turning[RK4 && NTURN ? 3 * NTURN : 1];
   Quad general[NE ? NE : 1][NE ? QUADS : 1];  // J of rows of no contact and no single dof
-  real general_gap[NE ? NE : 1], general_change[NE ? NE : 1], general_mass[NE ? NE : 1];
+  real general_residual[NE ? NE : 1], general_change[NE ? NE : 1];
+  real general_constraint_mass[NE ? NE : 1];
   union {
     Quad rows[SIDE][QUADS];  // below the diagonal M, above it what eliminates
     Quad subtree[NL][5];     // inertia [10], force [6]

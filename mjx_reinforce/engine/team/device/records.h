@@ -1,0 +1,41 @@
+// The rows of a model's tables that have several numbers. tables.py writes the rows, and has the
+// compiler check that both have the same fields in the same order.
+#pragma once
+
+// A part of a pair of geoms that makes one contact at most: an end of a capsule, a corner of a box.
+// The geoms are numbered among those that may meet.
+struct Item {
+  int packed;  // 12 bits of a geom, 12 bits of the other one, the part's number
+  DEV constexpr int first() const { return packed & 0xfff; }
+  DEV constexpr int second() const { return packed >> 12 & 0xfff; }
+  DEV constexpr int part() const { return packed >> 24 & 7; }
+};
+// Two numbers of 16 bits.
+struct Pair {
+  int packed;
+  DEV constexpr int low() const { return packed & 0xffff; }
+  DEV constexpr int high() const { return packed >> 16; }
+};
+
+// How hard a constraint row pushes back (MuJoCo's solref and solimp).
+struct Softness {
+  real stiffness, damping;    // MuJoCo's K and B
+  real least, rise;           // the impedance where a row begins, and by how much it grows
+  real width, middle, power;  // the way in which it grows (m or rad)
+};
+// What an actuator pushes with: gear * clip(gain * control + bias), where gain and bias are affine
+// in its length and speed.
+struct Actuator {
+  real gear, control_low, control_high;
+  real gain;
+  real bias, bias_by_length, bias_by_speed;
+  real force_low, force_high;
+  real gain_by_length, gain_by_speed;
+};
+// The limits of a joint, from where on they push, and the inverse mass of a row.
+struct Limit { real range[2], margin, weight; };
+// The most that friction loss pushes, and the inverse mass of its row.
+struct Loss { real most, weight; };
+struct Range { real low, high; };
+// Along the two tangents, about the normal, about the two tangents.
+struct Friction { real along[5]; };

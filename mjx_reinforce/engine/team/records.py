@@ -1,0 +1,88 @@
+"""The rows of a model's tables that have several numbers: the structs of ``device/records.h``.
+
+Both have the same fields in the same order, which ``checks`` lets the compiler of C++ see.
+"""
+
+from typing import NamedTuple
+
+from mjx_reinforce.engine.team.supported import GEOM_BITS
+
+
+class Softness(NamedTuple):
+    """The Softness of ``device/records.h``."""
+
+    stiffness: float
+    damping: float
+    least: float
+    rise: float
+    width: float
+    middle: float
+    power: float
+
+
+_ACTUATOR = (
+    "gear",
+    "control_low",
+    "control_high",
+    "gain",
+    "bias",
+    "bias_by_length",
+    "bias_by_speed",
+    "force_low",
+    "force_high",
+    "gain_by_length",
+    "gain_by_speed",
+)
+#: How many reals each field of a struct has.
+FIELDS = {
+    "Softness": dict.fromkeys(Softness._fields, 1),
+    "Actuator": dict.fromkeys(_ACTUATOR, 1),
+    "Limit": {"range": 2, "margin": 1, "weight": 1},
+    "Loss": {"most": 1, "weight": 1},
+    "Range": {"low": 1, "high": 1},
+    "Friction": {"along": 5},
+}
+#: The structs of the tables whose rows are some.
+STRUCTS = {
+    "item": "Item",
+    "paired": "Pair",
+    "jump": "Pair",
+    "soft": "Softness",
+    "actuator": "Actuator",
+    "dof_limit": "Limit",
+    "dof_loss": "Loss",
+    "dof_force": "Range",
+    "kind_friction": "Friction",
+}
+
+
+def size(type_name: str) -> int:
+    """Returns how many numbers a value of a type has."""
+    return sum(FIELDS.get(type_name, {"": 1}).values())
+
+
+def packed(low: int, high: int) -> int:
+    """Returns the Pair of ``device/records.h``."""
+    return low | high << 16
+
+
+def packed_item(first: int, second: int, part: int) -> int:
+    """Returns the Item of ``device/records.h``."""
+    return first | second << GEOM_BITS | part << 2 * GEOM_BITS
+
+
+def checks() -> list[str]:
+    """Returns C++ that does not compile unless ``device/records.h`` has the rows written here."""
+    item = f"Item{{{packed_item(0xABC, 0xDEF, 5)}}}"
+    pair = f"Pair{{{packed(0xABCD, 0x7654)}}}"
+    conditions = [
+        f"{item}.first() == 0xabc && {item}.second() == 0xdef && {item}.part() == 5",
+        f"{pair}.low() == 0xabcd && {pair}.high() == 0x7654",
+    ]
+    for struct, fields in FIELDS.items():
+        offset = 0
+        for field, count in fields.items():
+            conditions.append(f"__builtin_offsetof({struct}, {field}) == {offset} * sizeof(real)")
+            offset += count
+        conditions.append(f"sizeof({struct}) == {offset} * sizeof(real)")
+    return [f'static_assert({x}, "a row of tables.py");' for x in conditions]

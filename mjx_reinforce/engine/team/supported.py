@@ -1,0 +1,152 @@
+"""What teams of lanes play: which models of MuJoCo the device code covers."""
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from mjx_reinforce.engine.base import MjModel
+from mjx_reinforce.engine.physics.early_stop import stops_early
+from mjx_reinforce.engine.physics.mjx_internals import geom_pairs
+
+_C: Any = mujoco  # a C extension without stubs
+#: MuJoCo's mjtJoint.
+FREE, BALL, SLIDE, HINGE = range(4)
+#: MuJoCo's mjtGeom.
+PLANE, SPHERE, CAPSULE, BOX = (
+    int(getattr(_C.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "SPHERE", "CAPSULE", "BOX")
+)
+#: Bits of a mask of degrees of freedom, of which the widest is an unsigned long long.
+MAX_DOFS = 64
+#: Bits of a geom's number in a packed item, two of which and a part's number fit into an int.
+GEOM_BITS = 12
+_MAX_GEOMS = 2**GEOM_BITS
+_MAX_ITEMS = 4096
+#: How many contacts two geoms of these types may have, each of which is a part of the pair.
+NUM_PARTS = {
+    (PLANE, SPHERE): 1,
+    (SPHERE, SPHERE): 1,
+    (SPHERE, CAPSULE): 1,
+    (SPHERE, BOX): 1,
+    (CAPSULE, CAPSULE): 1,
+    (PLANE, CAPSULE): 2,
+    (CAPSULE, BOX): 2,
+    (PLANE, BOX): 4,
+}
+
+
+class GeomPair(NamedTuple):
+    """Two geoms that may meet.
+
+    first: the number of the flatter one
+    second: that of the other one
+    pair: the number of the pair that the model names; -1 where it names none
+    """
+
+    first: int
+    second: int
+    pair: int
+
+
+def why(mj_model: MjModel) -> str | None:
+    """Returns in one line why teams cannot play a model, or None if they can."""
+    model: Any = mj_model
+    for lacking in (_lacking_options, _lacking_parts, _lacking_actuators, _lacking_contacts):
+        for feature, present in lacking(model):
+            if present:
+                return f"the model has {feature}, which teams of lanes do not play"
+    return None
+
+
+def _lacking_options(model: Any) -> Iterable[tuple[str, Any]]:
+    """Yields what of a model's options the device code lacks, and whether the model has it."""
+    opt = model.opt
+    kinds = _C.mjtIntegrator
+    integrators = (kinds.mjINT_EULER, kinds.mjINT_RK4, kinds.mjINT_IMPLICITFAST)
+    yield "an integrator other than Euler, RK4 and implicitfast", opt.integrator not in integrators
+    yield "a solver other than Newton", opt.solver != _C.mjtSolver.mjSOL_NEWTON
+    few = f"few iterations of its solver ({opt.iterations}, {opt.ls_iterations} along a line)"
+    yield few, stops_early(model)
+    yield "elliptic friction cones", opt.cone != _C.mjtCone.mjCONE_PYRAMIDAL
+    flags = opt.disableflags | opt.enableflags | opt.disableactuator
+    yield "flags that disable or enable parts of the physics", flags
+    yield "noslip iterations", opt.noslip_iterations
+    yield "a medium with density or viscosity", opt.density or opt.viscosity
+
+
+def _lacking_parts(model: Any) -> Iterable[tuple[str, Any]]:
+    """Yields what of bodies and constraints the device code lacks, and whether a model has it."""
+    hinged = np.isin(model.jnt_type, (HINGE, SLIDE))
+    yield "no joints", not model.njnt
+    yield f"more than {MAX_DOFS} degrees of freedom", model.nv > MAX_DOFS
+    yield f"{_MAX_GEOMS} geoms or more", model.ngeom >= _MAX_GEOMS
+    yield "flexes or plugins", model.nflex or model.nplugin
+    yield "mocap bodies", model.nmocap
+    yield "gravity compensation", np.any(model.body_gravcomp)
+    # A tendon that only measures pushes nothing, and is no hindrance.
+    tendons = (
+        model.tendon_stiffness,
+        model.tendon_damping,
+        model.tendon_frictionloss,
+        model.tendon_limited,
+        model.tendon_armature,
+    )
+    yield "tendons that push", any(np.any(x) for x in tendons)
+    polynomials = (model.jnt_stiffnesspoly, model.dof_dampingpoly, model.jnt_springyield)
+    yield "polynomial springs or damping", any(np.any(x) for x in polynomials)
+    yield "springs of free or ball joints", np.any(model.jnt_stiffness[~hinged])
+    yield "limits of ball joints", np.any(model.jnt_limited[~hinged])
+    # MuJoCo integrates such bodies in a way of its own.
+    alone = np.bincount(model.dof_treeid, minlength=1) == 6
+    free = model.jnt_dofadr[model.jnt_type == FREE]
+    fast = model.opt.integrator == _C.mjtIntegrator.mjINT_IMPLICITFAST
+    yield "lone free bodies under implicitfast", fast and np.any(alone[model.dof_treeid[free]])
+    active = model.eq_type[np.asarray(model.eq_active0, bool)]
+    equalities = (_C.mjtEq.mjEQ_CONNECT, _C.mjtEq.mjEQ_JOINT)
+    yield "equalities other than connect and joint", not np.isin(active, equalities).all()
+
+
+def _lacking_actuators(model: Any) -> Iterable[tuple[str, Any]]:
+    """Yields what of actuators the device code lacks, and whether a model has it."""
+    of_joints = model.actuator_trntype == _C.mjtTrn.mjTRN_JOINT
+    yield "actuators of anything but joints", not of_joints.all()
+    joints = model.actuator_trnid[of_joints, 0]
+    hinged = np.isin(model.jnt_type[joints], (HINGE, SLIDE))
+    yield "actuators of free or ball joints", not hinged.all()
+    gains = np.isin(model.actuator_gaintype, (_C.mjtGain.mjGAIN_FIXED, _C.mjtGain.mjGAIN_AFFINE))
+    biases = np.isin(model.actuator_biastype, (_C.mjtBias.mjBIAS_NONE, _C.mjtBias.mjBIAS_AFFINE))
+    yield "gains or biases other than fixed and affine", not (gains.all() and biases.all())
+    yield "activations of actuators", model.na
+    inertias = (model.actuator_armature, model.actuator_damping, model.actuator_dampingpoly)
+    yield "actuators with armature or damping", any(np.any(x) for x in inertias)
+    yield "delays of actuators", np.any(model.actuator_delay)
+    yield "actuators of several controls", np.any(model.actuator_ctrlnum != 1)
+
+
+def _lacking_contacts(model: Any) -> Iterable[tuple[str, Any]]:
+    """Yields what of contacts the device code lacks, and whether a model has it."""
+    sticks = (model.geom_adhesion, model.geom_surfacevel, model.pair_adhesion)
+    yield "adhesion or moving surfaces", any(np.any(x) for x in sticks)
+    num_items = 0
+    for pair in meeting(model):
+        kinds = geom_kinds(model, pair)
+        names = [_C.mjtGeom(x).name.removeprefix("mjGEOM_").lower() for x in kinds]
+        yield f"a {names[1]} that meets a {names[0]}", kinds not in NUM_PARTS
+        num_items += NUM_PARTS[kinds]
+    yield f"more than {_MAX_ITEMS} possible contacts", num_items > _MAX_ITEMS
+
+
+def geom_kinds(model: Any, pair: GeomPair) -> tuple[int, int]:
+    """Returns MuJoCo's types of two geoms."""
+    return int(model.geom_type[pair.first]), int(model.geom_type[pair.second])
+
+
+def meeting(model: Any) -> list[GeomPair]:
+    """Returns the pairs of geoms that may meet, the flatter first; those of C's choice lead."""
+    numbered = ((int(pair), *sorted((int(g), int(h)))) for g, h, pair in geom_pairs(model))
+    pairs = []
+    for pair, *geoms in sorted(numbered):
+        flatter, rounder = sorted(geoms, key=model.geom_type.__getitem__)
+        pairs.append(GeomPair(flatter, rounder, pair))
+    return pairs
