@@ -460,9 +460,9 @@ def _rows_by_contact(model: mjx.Model, data: mjx.Data) -> list[Rows]:
     both_sides, loss = _kinds(data)
     rows = fields.efc_J, fields.efc_aref, fields.efc_D, both_sides
     groups = zip(*(contact_rows.by_group(division, x) for x in rows), strict=True)
-    contact_free = Rows(*(x[None, :num_contact_free] for x in rows))
     if loss is not None:  # of equalities and friction loss, never of a contact's rows
-        contact_free = contact_free._replace(loss=loss[None])
+        loss = loss[None]
+    contact_free = Rows(*(x[None, :num_contact_free] for x in rows), loss=loss)
     return [contact_free, *(Rows(*group) for group in groups)]
 
 
