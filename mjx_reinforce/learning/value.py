@@ -119,20 +119,14 @@ def value_baseline(
         observations = trajectory.observation.reshape(mask.size, -1)
         targets = (returns.reshape(-1) - mean) / unit
 
-        def fit(carry, index):
-            """One optimizer step on the mean squared error over a minibatch ``index`` [batch]."""
-            params, opt_state = carry
-
-            def squared_error(params):
-                predicted = value(params, observations[index], index // num_episodes)
-                return jnp.mean((predicted - targets[index]) ** 2)
-
-            grads = jax.grad(squared_error)(params)
-            changes, opt_state = fitter.update(grads, opt_state, params)
-            return (optax.apply_updates(params, changes), opt_state), None
+        def squared_error(params, index):
+            predicted = value(params, observations[index], index // num_episodes)
+            return jnp.mean((predicted - targets[index]) ** 2)
 
         indices = draw_steps(draw_key, mask, (num_fits, batch_size))
-        (params, opt_state), _ = lax.scan(fit, (critic.params, critic.opt_state), indices)
+        params, opt_state = _fit(
+            squared_error, fitter, critic.params, critic.opt_state, minibatches=indices
+        )
         return weight, Critic(params, opt_state, critic.seed, updates, mean, variance), metrics
 
     return Estimator(init, update)
@@ -228,6 +222,33 @@ def _first_params(network: nn.Module, key: jax.Array, inputs: int) -> Any:
     if shape != (1,):
         raise ValueError(f"the network must return values [..., 1], got {list(shape)}")
     return params
+
+
+def _fit(
+    loss: Callable[[Any, jax.Array], jax.Array],
+    optimizer: optax.GradientTransformation,
+    params: Any,
+    opt_state: Any,
+    minibatches: jax.Array,
+) -> tuple[Any, Any]:
+    """Returns the parameters and the optimizer's state after a step on each of F minibatches.
+
+    Args:
+      loss: (params, indices [B] of steps) -> the mean [] over them.
+      optimizer: what makes a step of a gradient.
+      params: of the network.
+      opt_state: of the optimizer.
+      minibatches: [F, B] indices of steps.
+    """
+
+    def fit(carry, index):
+        params, opt_state = carry
+        grads = jax.grad(loss)(params, index)
+        changes, opt_state = optimizer.update(grads, opt_state, params)
+        return (optax.apply_updates(params, changes), opt_state), None
+
+    (params, opt_state), _ = lax.scan(fit, (params, opt_state), minibatches)
+    return params, opt_state
 
 
 def _residual(
