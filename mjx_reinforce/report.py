@@ -179,7 +179,7 @@ def how_to_watch(experiment: Experiment, findings: Findings) -> str:
     """Returns the command that shows the best configuration's worst seed, "" if none was kept."""
     best = findings.results[0]
     worst = worst_seeds(best)[0]
-    seed, place = int(best.configuration.seed[worst]), best.configuration.where[worst]
+    seed, place = int(best.configuration.seed[worst]), best.configuration.directories[worst]
     if not (place / "config.json").is_file():  # a sweep
         first = experiment.directories[findings.order[0]]
         number = findings.order[0] - experiment.directories.index(first)
