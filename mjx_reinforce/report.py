@@ -199,7 +199,7 @@ def how_to_watch(experiment: Experiment, findings: Findings) -> str:
     best = findings.results[0]
     worst = worst_seeds(best)[0]
     seed = int(best.configuration.seed[worst])
-    place = best.configuration.where[worst]
+    place = best.configuration.directories[worst]
     # The directory of a sweep has no config.json, and a folder of policies for each configuration,
     # counted within the sweep: it may be one of several sources.
     if not (place / "config.json").is_file():

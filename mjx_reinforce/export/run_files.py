@@ -89,7 +89,7 @@ def read_run(directory: str | Path) -> Run:
         raise ValueError(f"{directory} is not a run directory: there is no {path}{hint}")
     config: dict[str, Any] = {"seeds": None, "env_set": []} | read_json(path)
     with naming_damage(path):
-        # In words, "0-99", of a share of a run; a list where a sweep kept a few.
+        # The text of --seeds, of a share of a run; a list where a sweep kept a few.
         if isinstance(config["seeds"], str):
             config["seeds"] = [*read_seeds(config["seeds"])]
         for name, kind in _KINDS.items():

@@ -16,7 +16,7 @@ class Configuration(NamedTuple):
     env_steps: [E, S] trained until then
     nonfinite: [S] updates that met numbers which are not finite
     seed: [S] each seed's number in its source
-    where: [S] the directory of each
+    directories: [S] the directory of each
     """
 
     label: str
@@ -25,7 +25,7 @@ class Configuration(NamedTuple):
     env_steps: np.ndarray
     nonfinite: np.ndarray
     seed: np.ndarray
-    where: Sequence[Path] = ()
+    directories: Sequence[Path] = ()
 
 
 class Source(NamedTuple):

@@ -146,15 +146,16 @@ def _join_parts(parts: Sequence[Configuration]) -> Configuration:
     """Returns one configuration of several shares; seeds that ended earlier repeat their last."""
     # A share ends with the slowest of its own seeds, so that shares differ in evaluations.
     length = max(len(part.eval_return) for part in parts)
-    where = [place for part in parts for place in part.where]
+    directories = [place for part in parts for place in part.directories]
     # ``order`` sorts the runs of all shares by their seeds.
     seed, order, times = np.unique(
         np.concatenate([part.seed for part in parts]), return_index=True, return_counts=True
     )
-    if len(order) < len(where):
+    if len(order) < len(directories):
+        names = " and ".join(map(str, dict.fromkeys(directories)))
         raise ValueError(
-            f"{' and '.join(map(str, dict.fromkeys(where)))} have seed {seed[times.argmax()]} in "
-            "common, with equal settings: give each share its own --seeds, or leave one out"
+            f"{names} have seed {seed[times.argmax()]} in common, with equal settings: give "
+            "each share its own --seeds, or leave one out"
         )
 
     def joined(name: str) -> np.ndarray:
@@ -166,7 +167,7 @@ def _join_parts(parts: Sequence[Configuration]) -> Configuration:
         env_steps=joined("env_steps"),
         nonfinite=np.concatenate([part.nonfinite for part in parts])[order],
         seed=seed,
-        where=[where[i] for i in order],
+        directories=[directories[i] for i in order],
     )
 
 
@@ -275,7 +276,7 @@ def _read_run(directory: Path, config: dict[str, Any]) -> Source:
         nonfinite = np.broadcast_to(counts, num_seeds)
         outcome = _outcome(summary)
     part = Configuration(
-        directory.name, {}, nonfinite=nonfinite, where=[directory] * num_seeds, **columns
+        directory.name, {}, nonfinite=nonfinite, directories=[directory] * num_seeds, **columns
     )
     provenance = {name: value for name, value in config.items() if name in PROVENANCE}
     # The engine that was chosen, in place of "auto" in the settings.
@@ -304,9 +305,9 @@ def _read_sweep(directory: Path, content: dict[str, Any]) -> Source:
             settings = swept[f"configuration {number}"]
             runs = curves["configuration"] == number
             columns = {name: curves[name][..., runs] for name in _COLUMNS}
-            where = [directory] * int(runs.sum())
+            directories = [directory] * int(runs.sum())
             label = settings_in_words(settings)
-            parts.append(Configuration(label, settings, where=where, **columns))
+            parts.append(Configuration(label, settings, directories=directories, **columns))
         return Source(
             directory=directory,
             env=content["env"],

@@ -10,9 +10,9 @@ import io
 import itertools
 import sys
 import tokenize
-from pathlib import Path
 from typing import NamedTuple
 
+from places import ROOT
 from sizes import code_lines, package_files
 
 #: Pronouns, participles, and other words that do not say what a value is.
@@ -26,7 +26,6 @@ _WORDS = """
 VAGUE = frozenset(_WORDS.split())
 #: A function of more lines of code than these has a docstring.
 UNDOCUMENTED_LINES = 6
-ROOT = Path(__file__).parents[2]
 
 
 class Departure(NamedTuple):

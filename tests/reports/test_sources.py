@@ -43,7 +43,7 @@ def test_shares_of_a_run_are_one_run(tmp_path):
     np.testing.assert_array_equal(part.eval_return, expected)
     assert part.seed.tolist() == [0, 1, 2, 3, 4]
     assert part.nonfinite.tolist() == [0, 0, 0, 1, 0]
-    assert [path.name for path in part.where] == ["a", "a", "a", "b", "b"]
+    assert [path.name for path in part.directories] == ["a", "a", "a", "b", "b"]
 
 
 @pytest.mark.parametrize(
