@@ -99,7 +99,9 @@ DEV void collide(const Team& t, const Model& M, State& s) {
       const unsigned touching_lanes = t.ballot(touches);
       if (touches) {
         const int at = num_contacts + count(touching_lanes & ((1u << lane) - 1));
-        contact_at(s, at) = contact_of(M, s, queued_item, touch);
+        const Contact contact = contact_of(M, s, queued_item, touch);
+        // Not by contact_at: stores through a reference to either would be to no known memory.
+        if (!FAR || at < NEAR) s.contacts[at] = contact; else s.far[at - NEAR] = contact;
       }
       num_contacts += count(touching_lanes);
       const int next = s.queue[W + lane];
