@@ -75,7 +75,9 @@ def vmap_rollout(
     start = jax.vmap(functools.partial(episode.begin, env), out_axes=(-1, 0))
     state, noise_keys = start(episode.episode_keys(key, num_episodes))
     # Where no episode takes the mode, none is computed: a training's updates.
-    modes = None if deterministic is False else jnp.broadcast_to(deterministic, num_episodes)
+    modes = None
+    if deterministic is not False:
+        modes = jnp.broadcast_to(deterministic, num_episodes)
     step = functools.partial(_step, env_step, act, distribution, actor, modes)
     no_episode = jnp.zeros(num_episodes, bool)
     if limit is None:

@@ -44,7 +44,9 @@ def physics_model(env: Any) -> PhysicsModel | None:
     while hasattr(env, "env"):
         env = env.env
     offer = getattr(env, "physics_model", None)
-    return None if offer is None else offer()
+    if offer is None:
+        return None
+    return offer()
 
 
 def team_physics(model: PhysicsModel) -> Physics:
