@@ -133,6 +133,7 @@ def _lacking_contacts(model: Any) -> Iterable[tuple[str, Any]]:
         kinds = geom_kinds(model, pair)
         names = [_C.mjtGeom(x).name.removeprefix("mjGEOM_").lower() for x in kinds]
         yield f"a {names[1]} that meets a {names[0]}", kinds not in NUM_PARTS
+        # A kind that is lacking does not get here: ``why`` stops at the first one.
         num_items += NUM_PARTS[kinds]
     yield f"more than {_MAX_ITEMS} possible contacts", num_items > _MAX_ITEMS
 

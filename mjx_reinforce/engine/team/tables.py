@@ -146,6 +146,8 @@ class _Tables:
             lines.append(f"  constexpr int table[] = {{{numbers}}};\n  return table[i];\n}}")
         lines.append("struct Model {")
         lines.append("  real timestep, smallest_gain;")
+        # In float32 a step that lowers the cost by less is rounding; in float64 the search goes on
+        # until no row changes.
         gain = 1e-10 * self.model.stat.meaninertia * self.model.nv
         initial_values = [
             f"real({float(self.model.opt.timestep)!r})",
@@ -249,6 +251,7 @@ class _Tables:
         for link in range(model.njnt):
             carried = [x for x in range(model.nbody) if self.frames[x].link == link]
             mass = sum(model.body_mass[x] for x in carried)
+            # A link may carry nothing: that of the first of two hinges of one body.
             com = np.zeros(3)
             if carried and mass != 0:
                 weighted = (model.body_mass[x] * bodies[x].com for x in carried)
@@ -271,6 +274,7 @@ class _Tables:
         joint_kind = model.jnt_type[joint]
         within = np.arange(model.nv) - model.jnt_dofadr[joint]
         is_single = joint_kind >= SLIDE
+        # A ball or a free joint moves along the axes of its own frame.
         axes = np.where(is_single[:, None], model.jnt_axis[joint], np.eye(3)[within % 3])
         kinds = np.full(model.nv, _TURNS)
         kinds[joint_kind == SLIDE] = _SHIFTS
@@ -419,6 +423,7 @@ class _Tables:
         for equality in connects:
             ends = (model.eq_obj1id[equality], model.eq_obj2id[equality])
             anchors = model.eq_data[equality, :6].reshape(2, 3)
+            # Between sites there are no anchors in eq_data: the sites are.
             if model.eq_objtype[equality] == _C.mjtObj.mjOBJ_SITE:
                 anchors = model.site_pos[list(ends)]
                 ends = model.site_bodyid[list(ends)]
@@ -431,6 +436,7 @@ class _Tables:
         self.reals["connect_at"] = places
         self.reals["connect_weight"] = [model.body_invweight0[x, 0].sum() for x in bodies]
         self.ints["connect_soft"] = self._equality_softs(connects)
+        # A joint alone is held at a value: its second is -1.
         joints = np.stack([model.eq_obj1id[joined], model.eq_obj2id[joined]], 1)
         dofs = np.where(joints >= 0, model.jnt_dofadr[joints], -1)
         self.ints["joined_dof"] = dofs
@@ -560,6 +566,7 @@ class _Tables:
             share = mix[0] / mix.sum() if mix.any() else 0.5
             refs = model.geom_solref[geoms]
             imps = model.geom_solimp[geoms]
+            # Stiffness itself and a time constant do not mix: C takes the smaller numbers.
             is_direct = (refs[:, 0] <= 0).any()
             ref = refs.min(0) if is_direct else share * refs[0] + (1 - share) * refs[1]
             imp = share * imps[0] + (1 - share) * imps[1]

@@ -185,6 +185,7 @@ class CText(Backend[str]):
             for array, outs in arrays:
                 self.fill(array, [out.cold for out in outs])
         self.lines += ["}", "t.sync();"]
+        # Whichever side was taken, its results are at the same places.
         for array, outs in arrays:
             self._written.update({out.leaf: Place(array, k) for k, out in enumerate(outs)})
         return [self.leaf(out.leaf) for out in gate.outs]
@@ -329,6 +330,7 @@ class CText(Backend[str]):
         """Writes a call of the physics, whose state ``s`` is one for all calls of a program."""
         names = [field.rpartition(".")[2] for field in call.fields]
         sound = self.name()
+        # Of all that the task may read, only this is a result, and not a field of the state.
         fields = {**_FIELDS, "sound": sound}
         for field, scalars in zip(_OPERANDS, call.args, strict=True):
             if scalars:
