@@ -16,7 +16,13 @@ from sizes import package_files
 OUTSIDE = """
     DIR ID NAME RUN RUN_OR_SWEEP VALUE sum_n sum_t seed_0
     Acc EpisodeWrapper JaxprEqn Linear SummaryWriter Vel binomtest custom_vjp do_simulation nohup
-    platform_dependent simple tip
+    np_random platform_dependent simple tip __future__ annotations
+    """
+#: Functions and variables in the source of C MuJoCo, to which comments on our physics point.
+C_MUJOCO = """
+    MakeHessian PrimalPrepare PrimalUpdateGrad actrange axisdir bestdistmax clcorner clipHalfPlane
+    frictionCost frictionCostDif getsolparam gtol mjBOXBOX_EDGEBIAS mjPrimalPnt mjd_actuator_vel
+    mjd_passive_vel updateBracket warmstart wrap_
     """
 #: What others' names follow.
 LIBRARIES = ("gymnasium", "jax", "mjx", "mujoco")
@@ -68,7 +74,7 @@ def test_names_in_double_backticks_exist():
     """Somewhere in the code; of a module and a class of ours, there."""
     paths = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*")]
     known = {part for path in [*paths, *ROOT.iterdir()] for part in re.split(r"\W+", path.name)}
-    known = known.union(OUTSIDE.split(), dir(mujoco.MjData), dir(mujoco.MjModel))
+    known = known.union(OUTSIDE.split(), C_MUJOCO.split(), dir(mujoco.MjData), dir(mujoco.MjModel))
     known = known.union(*map(names, FILES))
     modules = dict.fromkeys(("", *LIBRARIES), known)
     for path in [*FILES, *(ROOT / "experiments").rglob("*.py")]:

@@ -30,7 +30,7 @@ def tendon_armature(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 def _coupled(model: mjx.Model) -> np.ndarray:
     """Returns where C's inertia matrix has entries, [nv, nv]."""
-    # Compressed rows of the lower triangle, ``mjData.M``.
+    # Compressed rows of the lower triangle, as mjData keeps ``M``.
     lower = np.zeros((model.nv, model.nv), bool)
     lower[np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind] = True
     return lower | lower.T
