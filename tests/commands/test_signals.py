@@ -39,6 +39,8 @@ with Interrupt():
     print("listening", flush=True)
     time.sleep(60)
 """
+#: The runs of a test.
+STARTED: list[subprocess.Popen[str]] = []
 UNBEGUN = "stopped before training began; nothing was written\n"
 
 
@@ -50,10 +52,18 @@ def ctrl_c_is_heard():
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.fixture(autouse=True)
+def no_run_goes_on():
+    """A test that fails leaves no run behind, which would train for days beside other tests."""
+    yield
+    while STARTED:
+        STARTED.pop().kill()
+
+
 def start(directory, *arguments, cache=None):
     environment = os.environ | {"PYTHONWARNINGS": "ignore:JAX 0.10.2 computes some products"}
     environment |= {"JAX_COMPILATION_CACHE_DIR": str(cache)} if cache else {}
-    return subprocess.Popen(
+    process = subprocess.Popen(
         [sys.executable, "-m", "mjx_reinforce.train", *map(str, arguments)],
         cwd=directory,
         env=environment,
@@ -61,6 +71,8 @@ def start(directory, *arguments, cache=None):
         stderr=subprocess.PIPE,
         text=True,
     )
+    STARTED.append(process)
+    return process
 
 
 def wait_for(condition, process, seconds=200):
@@ -115,7 +127,11 @@ def test_signals_and_kills_cost_no_byte(tmp_path):
 @pytest.mark.slow
 def test_an_ssh_that_ends_is_answered_as_sigterm(tmp_path):
     """With a summary and a last checkpoint, from which the run goes on."""
-    process = start(tmp_path, *FOREVER)
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # also where tests run under nohup
+    try:
+        process = start(tmp_path, *FOREVER)
+    finally:
+        signal.signal(signal.SIGHUP, before)
     wait_for(lambda: rows(tmp_path) > 20, process)
     for _ in range(2):
         process.send_signal(signal.SIGHUP)
