@@ -19,7 +19,7 @@ class Backend(abc.ABC, Generic[Value]):
     branch computes is known only inside, so it is run in an environment of its own (``inside``).
 
     OPERATIONS: what the backend makes of each operation, by name, with an entry for every
-      name of ``nodes.FACTS``; None for a backend without a table of its own.
+      name of ``nodes.OP_TRAITS``; None for a backend without a table of its own.
     """
 
     OPERATIONS: ClassVar[Mapping[str, Any] | None] = None

@@ -133,7 +133,7 @@ class Graph:
         """Applies one of the named operations to scalars."""
         # The last operand has the dtype of the result: of a selection the first is a predicate.
         dtype = args[-1].dtype
-        if nodes.FACTS[name].is_predicate:
+        if nodes.OP_TRAITS[name].is_predicate:
             dtype = nodes.BOOL
         return self.apply(Op(name), args, dtype)
 
@@ -172,7 +172,7 @@ class Graph:
           dtype: that of the result.
         """
         identities = [arg if isinstance(arg, Node) else nodes.identity(arg) for arg in args]
-        commutes = nodes.FACTS[op.name].commutes
+        commutes = nodes.OP_TRAITS[op.name].commutes
         key = (op, frozenset(identities) if commutes else tuple(identities))
         # No node of these operands can be further outside than the innermost of them.
         outermost = max([node.scope.depth for node in operands])

@@ -20,7 +20,7 @@ from jax.extend import core
 from jax.interpreters import partial_eval
 
 from mjx_reinforce.engine.base import PyTree, is_key
-from mjx_reinforce.engine.scalar.nodes import FACTS
+from mjx_reinforce.engine.scalar.nodes import OP_TRAITS
 
 # The parameter under which a call-like primitive keeps the jaxpr that it calls.
 _CALLEE_PARAMS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
@@ -322,7 +322,7 @@ def source(eqn: Equation) -> str:
 
 def operation(name: str) -> Callable[..., Any]:
     """Returns JAX's function for an operation of the scalar graph."""
-    return getattr(lax, FACTS[name].in_jax or name)
+    return getattr(lax, OP_TRAITS[name].lax_name or name)
 
 
 def compute_constants(

@@ -22,7 +22,7 @@ kept whole      ``base.keeping_whole``, in ``play/program.py`` around
                 shapes does not trace the physics.
 ==============  ======================================================================
 
-Who asks, and why:
+Who asks, and why (kept by hand: a new caller adds its row):
 
 ====================================  =============================================================
 ``is_written_out``

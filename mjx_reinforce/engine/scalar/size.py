@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from mjx_reinforce.engine.scalar import jaxprs
-from mjx_reinforce.engine.scalar.nodes import FACTS
+from mjx_reinforce.engine.scalar.nodes import OP_TRAITS
 
 #: What is larger takes more than some 80 s to write and compile. On two quiet cores a training had
 #: started after 48 s with Humanoid-v5 (1.9 million), 54 s with dm_control's humanoid (2.7 million).
@@ -19,7 +19,7 @@ MAX_SCALARS = 4_000_000
 _PER_PAIR = 1.35
 #: A loop's body is written again and again until what never changes in it is known.
 _LOOP = 2
-_ELEMENTWISE = {*FACTS, "integer_pow", "square", "add_any", "clamp"}
+_ELEMENTWISE = {*OP_TRAITS, "integer_pow", "square", "add_any", "clamp"}
 
 
 class TooLarge(NotImplementedError):  # noqa: N818 (reads as what it is)

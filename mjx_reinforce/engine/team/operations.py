@@ -6,7 +6,7 @@ What is not plain C++ is a function of ``device/scalar.h``.
 import numpy as np
 
 from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive
-from mjx_reinforce.engine.scalar.nodes import FACTS, Op
+from mjx_reinforce.engine.scalar.nodes import OP_TRAITS, Op
 
 #: The C++ type of each dtype.
 _TYPE_NAMES = {
@@ -83,7 +83,7 @@ def expression(op: Op, dtype: np.dtype, arg_dtypes: list[np.dtype], args: list[s
     Args:
       op: the operation.
       dtype: of its result.
-      kinds: the dtypes of its operands.
+      arg_dtypes: the dtypes of its operands.
       args: its operands.
     """
     name = op.name
@@ -114,7 +114,7 @@ def expression(op: Op, dtype: np.dtype, arg_dtypes: list[np.dtype], args: list[s
         return f"{args[0]} < 0 ? -{args[0]} : {args[0]}"
     if name in _DEVICE_FUNCTIONS:
         return f"{_DEVICE_FUNCTIONS[name]}({', '.join(args)})"
-    assert name in FACTS
+    assert name in OP_TRAITS
     raise UnsupportedPrimitive(f"it has no C++ for {name!r}")
 
 

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from mjx_reinforce.engine.scalar import jaxprs
-from mjx_reinforce.engine.scalar.nodes import FACTS, Node, Op, Scalar, is_constant, same
+from mjx_reinforce.engine.scalar.nodes import OP_TRAITS, Node, Op, Scalar, is_constant, same
 
 # Greater powers are not faster as products than as ``pow``.
 _LARGEST_POWER = 8
@@ -48,7 +48,7 @@ def fold(op: Op, operands: Sequence[Any], dtype: np.dtype) -> Any:
         value = np.asarray(operands[0]).astype(dtype)
     elif name == "bitcast_convert_type":
         value = np.asarray(operands[0]).view(dtype)
-    elif (by_numpy := _EXCEPTIONS.get(name, FACTS[name].in_numpy)) is not None:
+    elif (by_numpy := _EXCEPTIONS.get(name, OP_TRAITS[name].numpy_function)) is not None:
         value = by_numpy(*operands)
     else:
         value = jaxprs.compute_constants(jaxprs.operation(name), dict(op.params), operands)[0]

@@ -9,7 +9,7 @@ from mjx_reinforce.engine.scalar import arrays, jaxprs
 from mjx_reinforce.engine.scalar.arrays import Array, Results
 from mjx_reinforce.engine.scalar.graph import Graph
 from mjx_reinforce.engine.scalar.jaxprs import Equation
-from mjx_reinforce.engine.scalar.nodes import FACTS, Op, conversion
+from mjx_reinforce.engine.scalar.nodes import OP_TRAITS, Op, conversion
 from mjx_reinforce.engine.scalar.passes import simplify
 
 
@@ -90,7 +90,7 @@ def _elementwise(graph: Graph, eqn: Equation, *operands: Array) -> Results:
     """The general rule: the operation has the primitive's name."""
     name = eqn.primitive.name
     params = ()
-    if FACTS[name].has_params:
+    if OP_TRAITS[name].has_params:
         params = tuple(sorted(eqn.params.items()))
     return [_map_op(graph, Op(name, params), eqn.outvars[0].aval, operands)]
 
@@ -159,7 +159,7 @@ RULES = {
     "iota": _iota,
     "empty": _moved(lambda _, aval: arrays.zeros(aval)),
     "platform_index": _platform_index,
-    **dict.fromkeys(FACTS, _elementwise),
+    **dict.fromkeys(OP_TRAITS, _elementwise),
     "convert_element_type": _convert,
     "bitcast_convert_type": _bitcast,
     "add_any": lambda graph, eqn, x, y: [_map_op(graph, Op("add"), eqn.outvars[0].aval, (x, y))],
