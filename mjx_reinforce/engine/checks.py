@@ -25,7 +25,7 @@ _LIBRARIES = [path.resolve() for path in (*_PYTHON, _PACKAGE, _PACKAGE / "envs")
 #: Characters of somebody else's message that are shown.
 _MAX_MESSAGE = 300
 #: How alike names are, as ``difflib`` counts, of which a third of the letters differ.
-_ALIKE = 0.66
+_MIN_SIMILARITY = 0.66
 #: What every environment has.
 _MEMBERS = ("reset", "step", "action_size")
 
@@ -55,9 +55,9 @@ class BadEnvironmentError(ValueError):
     """An environment's code does not do what an environment must."""
 
 
-def require(holds: object, message: str) -> None:
+def require(condition: object, message: str) -> None:
     """Raises BadEnvironmentError unless something holds."""
-    if not holds:
+    if not condition:
         raise BadEnvironmentError(message)
 
 
@@ -239,11 +239,11 @@ def check_parts(env: object) -> None:
     if isinstance(env, type):
         raise BadEnvironmentError(f"{env.__name__} is a class, not an environment yet: call it")
     try:
-        missing = [member for member in _MEMBERS if not hasattr(env, member)]
+        missing_members = [member for member in _MEMBERS if not hasattr(env, member)]
     except Exception as error:  # action_size may be a property, the user's code
         raise BadEnvironmentError(f"{name}.action_size fails: {explain(error)}") from error
-    lacks = f"{name} is not an environment: it has no {', '.join(missing)}"
-    require(not missing, f"{lacks}; mjx_reinforce.Environment says what one has")
+    complaint = f"{name} is not an environment: it has no {', '.join(missing_members)}"
+    require(not missing_members, f"{complaint}; mjx_reinforce.Environment says what one has")
 
 
 def known_number(value: Any) -> float | None:
@@ -275,11 +275,11 @@ def check_number(name: str, value: object, *, positive: bool = False, finite: bo
     raise ValueError(f"{name} must be {kind}, got {value!r}")
 
 
-def check_count(name: str, value: int, least: int = 1) -> None:
-    """Raises ValueError for what is no whole number, or one that is less than ``least``."""
+def check_count(name: str, value: int, minimum: int = 1) -> None:
+    """Raises ValueError for what is no whole number, or one that is less than ``minimum``."""
     check_type(name, value, int)
-    if value < least:
-        raise ValueError(f"{name} must be at least {least}, got {value}")
+    if value < minimum:
+        raise ValueError(f"{name} must be at least {minimum}, got {value}")
 
 
 def check_key(key: object) -> None:
@@ -287,8 +287,8 @@ def check_key(key: object) -> None:
     import jax
 
     dtype = getattr(key, "dtype", None)
-    typed = dtype is not None and jax.numpy.issubdtype(dtype, jax.dtypes.prng_key)
-    if not (typed or dtype == jax.numpy.uint32):
+    is_typed = dtype is not None and jax.numpy.issubdtype(dtype, jax.dtypes.prng_key)
+    if not (is_typed or dtype == jax.numpy.uint32):
         raise ValueError(f"the key must be a random key, such as jax.random.key(0), got {key!r}")
 
 
@@ -302,8 +302,8 @@ def check_name(kind: str, name: str, table: Mapping[str, Any]) -> None:
     """
     if name in table:
         return
-    near = nearest(name, table)
-    hint = f" Did you mean {near!r}?" if near else ""
+    nearest_name = nearest(name, table)
+    hint = f" Did you mean {nearest_name!r}?" if nearest_name else ""
     raise ValueError(f"unknown {kind} {name!r}.{hint} Known: {', '.join(sorted(table))}.")
 
 
@@ -315,16 +315,16 @@ def nearest(name: str, names: Iterable[str]) -> str | None:
         two names alike.
       names: of versions of one name the last is meant, unless the user typed another.
     """
-    typed = _plain(name)
+    query = _plain(name)
     versions: dict[str, list[str]] = {}
     for candidate in sorted(names):
         versions.setdefault(_plain(candidate), []).append(candidate)
     # Of names that hold what was typed the most alike is meant, however much longer it is.
-    containing = [plain_name for plain_name in versions if len(typed) > 2 and typed in plain_name]
-    if containing:
-        matches = difflib.get_close_matches(typed, containing, n=1, cutoff=0)
+    supernames = [plain_name for plain_name in versions if len(query) > 2 and query in plain_name]
+    if supernames:
+        matches = difflib.get_close_matches(query, supernames, n=1, cutoff=0)
     else:
-        matches = difflib.get_close_matches(typed, versions, n=1, cutoff=_ALIKE)
+        matches = difflib.get_close_matches(query, versions, n=1, cutoff=_MIN_SIMILARITY)
     if not matches:
         return None
     return difflib.get_close_matches(name, versions[matches[0]], n=1, cutoff=0)[0]

@@ -134,7 +134,9 @@ def emulate(monkeypatch, threads=1, block=None):
             address = compiled_team(written)
             return ptx.Kernel(source, "cuda", str(address), launch, compiled=True)
         code = compiled(written.text, block)
-        return ptx.Kernel(code.key, "ptx", str(code.addresses[ENTRY]), Launch(256, 1), compiled=True)
+        return ptx.Kernel(
+            code.key, "ptx", str(code.addresses[ENTRY]), Launch(256, 1), compiled=True
+        )
 
     def call(kernel, grid, given, first, results):
         size = 32 * -(-threads // 32)

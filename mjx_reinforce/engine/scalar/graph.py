@@ -18,7 +18,7 @@ from mjx_reinforce.engine.scalar.passes import simplify
 from mjx_reinforce.engine.scalar.size import MAX_SCALARS, TooLarge
 
 #: ``size`` foresees what is written; where it errs, writing ends here.
-_MOST = 3 * MAX_SCALARS
+_MAX_NODES = 3 * MAX_SCALARS
 
 
 class Graph:
@@ -70,7 +70,7 @@ class Graph:
 
         Inside of a jitted function of JAX no line is the user's.
         """
-        innermost_first = [eqn, *(self._equations[number] for number in reversed(self.path))]
+        innermost_first = [eqn, *(self._equations[index] for index in reversed(self.path))]
         return next(filter(None, map(jaxprs.source, innermost_first)), "an unknown line")
 
     def loop_body(self) -> AbstractContextManager[Scope]:
@@ -153,11 +153,11 @@ class Graph:
             return simplify.fold(op, args, dtype)
         # Every request counts, also one that an existing node answers: it takes its time.
         self._num_applied += 1
-        if self._num_applied > _MOST:
-            raise TooLarge(f"written out it is more than {_MOST:,} scalar operations")
-        simpler = simplify.simplify(self, op, args, dtype)
-        if simpler is not None:
-            return simpler
+        if self._num_applied > _MAX_NODES:
+            raise TooLarge(f"written out it is more than {_MAX_NODES:,} scalar operations")
+        simple_form = simplify.simplify(self, op, args, dtype)
+        if simple_form is not None:
+            return simple_form
         return self._share(op, args, operands, dtype)
 
     def _share(

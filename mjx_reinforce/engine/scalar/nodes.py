@@ -4,9 +4,9 @@ A *scalar* is a NumPy scalar (a constant) or a ``Node`` (a value that each lane 
 own of, or that all lanes share). The body of a loop and an expensive branch are scopes of their
 own: a node placed there is not visible outside.
 
-``OP_TRAITS`` is the one table of the operations, and of how each is computed. JAX computes an operation
-on lanes, NumPy computes it on constants. ``simplify`` lists what NumPy has no one function for, and
-a backend that does not go through JAX lists what it writes instead.
+``OP_TRAITS`` is the one table of the operations, and of how each is computed. JAX computes an
+operation on lanes, NumPy computes it on constants. ``simplify`` lists what NumPy has no one
+function for, and a backend that does not go through JAX lists what it writes instead.
 """
 
 import dataclasses
