@@ -110,8 +110,8 @@ def fits(value: object, kind: object) -> bool:
     # Python's bool is an int; a setting that is a number is not to be True.
     if kind in (int, float) and isinstance(value, bool):
         return False
-    expected = _KINDS[kind].type if kind in _KINDS else kind
-    return not isinstance(expected, type) or isinstance(value, expected)
+    allowed_type = _KINDS[kind].type if kind in _KINDS else kind
+    return not isinstance(allowed_type, type) or isinstance(value, allowed_type)
 
 
 def _fits_tuple(value: object, arguments: tuple[Any, ...]) -> bool:
@@ -292,32 +292,32 @@ def check_key(key: object) -> None:
         raise ValueError(f"the key must be a random key, such as jax.random.key(0), got {key!r}")
 
 
-def check_name(kind: str, name: str, table: Mapping[str, Any]) -> None:
+def check_name(kind: str, name: str, choices: Mapping[str, Any]) -> None:
     """Raises ValueError for a name that is not in a table, with its names and the nearest of them.
 
     Args:
       kind: what is named, for the message.
       name: what the user typed.
-      table: has the names.
+      choices: has the names.
     """
-    if name in table:
+    if name in choices:
         return
-    nearest_name = nearest(name, table)
+    nearest_name = nearest(name, choices)
     hint = f" Did you mean {nearest_name!r}?" if nearest_name else ""
-    raise ValueError(f"unknown {kind} {name!r}.{hint} Known: {', '.join(sorted(table))}.")
+    raise ValueError(f"unknown {kind} {name!r}.{hint} Known: {', '.join(sorted(choices))}.")
 
 
-def nearest(name: str, names: Iterable[str]) -> str | None:
+def nearest(name: str, choices: Iterable[str]) -> str | None:
     """Returns the name that somebody meant, whatever the case of the letters, if any is near.
 
     Args:
       name: what the user typed; a name that contains it is near. A version, such as -v5, makes no
         two names alike.
-      names: of versions of one name the last is meant, unless the user typed another.
+      choices: of versions of one name the last is meant, unless the user typed another.
     """
     query = _plain(name)
     versions: dict[str, list[str]] = {}
-    for candidate in sorted(names):
+    for candidate in sorted(choices):
         versions.setdefault(_plain(candidate), []).append(candidate)
     # Of names that hold what was typed the most alike is meant, however much longer it is.
     supernames = [plain_name for plain_name in versions if len(query) > 2 and query in plain_name]

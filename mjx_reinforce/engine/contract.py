@@ -247,8 +247,8 @@ def check_shape(name: str, value: object, *shapes: tuple[int, ...], remedy: str 
       remedy: what to do instead, for the message.
     """
     if shape_of(value) not in shapes:
-        expected = " or ".join(str(list(shape)) for shape in shapes)
-        raise ValueError(f"{name} must be {expected}, got {in_words(value)}{remedy}")
+        shape_words = " or ".join(str(list(shape)) for shape in shapes)
+        raise ValueError(f"{name} must be {shape_words}, got {in_words(value)}{remedy}")
 
 
 def shape_of(value: Any) -> tuple[int, ...] | None:

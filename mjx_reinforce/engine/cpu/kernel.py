@@ -117,7 +117,7 @@ def layout(leaves: list[Any], num_actor: int, lanes: int) -> VectorLayout:
         return Field(offset, np.dtype(dtype), entries)
 
     inputs = [field(x.dtype, int(np.prod(x.shape, dtype=int))) for x in leaves]
-    *state, keys, step, deterministic, alive = inputs[num_actor:]
+    *state, keys, step, deterministic, alive_mask = inputs[num_actor:]
     return VectorLayout(
         inputs=inputs,
         actor=[x for x in inputs[:num_actor] if x.entries],
@@ -126,7 +126,7 @@ def layout(leaves: list[Any], num_actor: int, lanes: int) -> VectorLayout:
         key=keys._replace(entries=2),
         step=step,
         deterministic=deterministic,
-        alive=alive,
+        alive=alive_mask,
         broken=field(np.int32, 1),
         limit=field(np.int32, 1),
         seed=field(np.int64, 1),

@@ -147,10 +147,10 @@ class LLVM(Backend[Value]):
         # A loop that runs at least once has its test at the end. It ends with what its last
         # iteration computed, so that a carry that the body does not read needs no phi.
         has_iteration = bool(loop.length) and loop.active is None
-        in_place = set(leaves)
+        place_leaves = set(leaves)
         if has_iteration:
-            in_place |= liveness.unread(loop)
-        carries = [carry for carry in loop.carries if carry.leaf not in in_place]
+            place_leaves |= liveness.unread(loop)
+        carries = [carry for carry in loop.carries if carry.leaf not in place_leaves]
         inits = [self.value(carry.init, values) for carry in carries]
         readers = [self._reader(e.leaf, e.values, values) for e in loop.elements]
         record_arrays = [text.reserve(r.value.dtype, loop.length or 0) for r in loop.records]
@@ -175,9 +175,9 @@ class LLVM(Backend[Value]):
         for element, reader in zip(loop.elements, readers, strict=True):
             leaves[element.leaf] = reader(count)
         scope = self.inside(loop.body, values, leaves)
-        for record, array in zip(loop.records, record_arrays, strict=True):
+        for record, array_name in zip(loop.records, record_arrays, strict=True):
             dtype = record.value.dtype
-            text.store(self.value(record.value, scope), text.at(array, dtype, count), dtype)
+            text.store(self.value(record.value, scope), text.at(array_name, dtype, count), dtype)
         next_values = [self.value(carry.next, scope) for carry in carries]
         types = [text.type(carry.leaf.dtype) for carry in carries]
         if skip_labels:
@@ -209,11 +209,11 @@ class LLVM(Backend[Value]):
           record_arrays: pointers to the values of each record.
         """
         places: list[Value] = []
-        for record, array in zip(loop.records, record_arrays, strict=True):
+        for record, array_name in zip(loop.records, record_arrays, strict=True):
             dtype = record.value.dtype
             for t, out in enumerate(record.outs):
-                self._recorded[out] = (array, t)
-                places.append(Memory(self._text.at(array, dtype, t), dtype))
+                self._recorded[out] = (array_name, t)
+                places.append(Memory(self._text.at(array_name, dtype, t), dtype))
         return places
 
     def _in_place(self, loop: LiveLoop, values: dict[Node, Value]) -> dict[Node, Value]:

@@ -94,10 +94,10 @@ _ERF_INV_TAIL_64 = (
 
 def _reduced(x: Lanes) -> tuple[Lanes, Lanes]:
     """Returns x - n ln 2, within ln 2 / 2, and integers whose last bits are those of n."""
-    rounded = x * (1 / math.log(2)) + ROUND_BITS
-    n = rounded - ROUND_BITS
+    sum_bits = x * (1 / math.log(2)) + ROUND_BITS
+    n = sum_bits - ROUND_BITS
     # n times the first part of ln 2 does not round; the second part has its further digits.
-    return x - n * _LN2[0] - n * _LN2[1], rounded.bits()
+    return x - n * _LN2[0] - n * _LN2[1], sum_bits.bits()
 
 
 def _exp_less_1(x: Lanes) -> Lanes:
@@ -151,8 +151,8 @@ def tanh(x: Lanes) -> Lanes:
     remainder, n = _reduced(size * 2)
     scale = _power_of_2(n)
     # y is higher + (scale - 1): near zero, where the scale is 1, it is higher, and loses no digit.
-    higher = _exp_less_1(remainder) * scale
-    return ((higher + (scale - 1)) / (higher + (scale + 1))).call("copysign", x)
+    exp_term = _exp_less_1(remainder) * scale
+    return ((exp_term + (scale - 1)) / (exp_term + (scale + 1))).call("copysign", x)
 
 
 def _log_of_parts(fraction: Lanes, exponent: Lanes) -> Lanes:
@@ -215,11 +215,11 @@ def _log2(x: Lanes) -> Lanes:
 
 def _exp2(x: Lanes) -> Lanes:
     """Returns 2^x of |x| <= 300, float64, to 1e-12; the series."""
-    rounded = x + _ROUND_64
-    remainder = x - (rounded - _ROUND_64)
+    sum_bits = x + _ROUND_64
+    remainder = x - (sum_bits - _ROUND_64)
     powers = range(10, -1, -1)
     series = remainder.polynomial(*(math.log(2) ** k / math.factorial(k) for k in powers))
-    return series * ((rounded.bits() + 1023) << 52).bits()
+    return series * ((sum_bits.bits() + 1023) << 52).bits()
 
 
 def pow(x: Lanes, y: Lanes) -> Lanes:
@@ -268,16 +268,16 @@ def _large(x: Lanes) -> tuple[Lanes, Lanes]:
     # A whole turn is 2^64 here, and wraps around; a quarter is 2^62. Half a quarter rounds n.
     n = (turn + 2**61) >> 62
     # The 32 highest bits of what is left are more than float32 holds.
-    part = ((turn - (n << 62)) >> 32).convert("trunc", "int32").convert("sitofp", "float32")
-    remainder = (x < INFINITY).where(part * (6.283185307179586 / 2**32), math.nan)
+    fraction = ((turn - (n << 62)) >> 32).convert("trunc", "int32").convert("sitofp", "float32")
+    remainder = (x < INFINITY).where(fraction * (6.283185307179586 / 2**32), math.nan)
     return remainder, n.convert("trunc", "int32")
 
 
 def _reduce_angle(x: Lanes) -> tuple[Lanes, Lanes]:
     """Returns x - n pi / 2 within pi / 4 and the last bits of the integer n, for x >= 0."""
-    rounded = x * (2 / 3.141592653589793) + ROUND_BITS
-    n = rounded - ROUND_BITS
-    small_pair = (x - n * _HALF_PI[0] - n * _HALF_PI[1] - n * _HALF_PI[2], rounded.bits())
+    sum_bits = x * (2 / 3.141592653589793) + ROUND_BITS
+    n = sum_bits - ROUND_BITS
+    small_pair = (x - n * _HALF_PI[0] - n * _HALF_PI[1] - n * _HALF_PI[2], sum_bits.bits())
     is_large = x > _LARGE_ANGLE
     entry = x.text.block
     # Large angles are rare and take many operations: a branch that runs if some lane needs it.

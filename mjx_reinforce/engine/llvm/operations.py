@@ -64,8 +64,8 @@ def _divide(op: Op, dtype: np.dtype, x: Lanes, y: Lanes) -> Lanes:
     is_signed = dtype.kind == "i"
     all_ones = x.like(~dtype.type(0))  # of unsigned integers the greatest
 
-    def where_y_is(number: Lanes | int, chosen: Lanes | int, otherwise: Lanes) -> Lanes:
-        return y.compare("eq", number).where(chosen, otherwise)
+    def where_y_is(y_value: Lanes | int, choice: Lanes | int, default: Lanes) -> Lanes:
+        return y.compare("eq", y_value).where(choice, default)
 
     # Lanes whose divisor is 0 or -1 divide by 1 instead, and their results are put in afterwards.
     # The rest of a division by -1 is the same 0 as that by 1.

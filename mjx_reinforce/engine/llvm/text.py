@@ -249,12 +249,12 @@ class Text:
         value = f"[{len(literals)} x {scalar}] [{entries}]"
         return self._tables.setdefault(value, f"@t{len(self._tables)}")
 
-    def spread(self, dtype: DTypeLike, table: str, index: str) -> str:
+    def spread(self, dtype: DTypeLike, table_name: str, index: str) -> str:
         """Returns an entry of a table in every lane."""
         scalar = scalar_type(dtype)
-        place = self.let(f"getelementptr inbounds {scalar}, ptr {table}, i64 {index}")
-        entry = self.let(f"load {scalar}, ptr {place}")
-        return self.broadcast(scalar, entry)
+        place = self.let(f"getelementptr inbounds {scalar}, ptr {table_name}, i64 {index}")
+        element = self.let(f"load {scalar}, ptr {place}")
+        return self.broadcast(scalar, element)
 
     def broadcast(self, scalar: str, value: str) -> str:
         """Returns a scalar in every lane."""

@@ -31,12 +31,12 @@ class Group(NamedTuple):
 
     contacts: how many
     pyramid: [rows of a contact, vectors of its basis] the rows as sums of the vectors
-    coupled: [nv, nv] whether rows of one of them may have both degrees of freedom
+    coupling: [nv, nv] whether rows of one of them may have both degrees of freedom
     """
 
     contacts: int
     pyramid: np.ndarray
-    coupled: np.ndarray
+    coupling: np.ndarray
 
 
 class Blocks(NamedTuple):
@@ -71,8 +71,8 @@ def blocks(num_contact_free: int, dims: np.ndarray, couplings: Mapping[int, np.n
     """
     # MJX orders contacts by their dimension, so that each group's rows are next to one another.
     groups = tuple(
-        Group(int((dims == dim).sum()), _pyramid(dim), coupled)
-        for dim, coupled in sorted(couplings.items())
+        Group(int((dims == dim).sum()), _pyramid(dim), coupling)
+        for dim, coupling in sorted(couplings.items())
         if (dims == dim).any()
     )
     return Blocks(num_contact_free, groups)
@@ -136,10 +136,10 @@ def _of_touching(function: Callable, rows: jax.Array, is_touching: jax.Array) ->
     """Returns a function of the rows of each contact that touches; zeros for the others."""
 
     def apply(_: None, contact: tuple) -> tuple[None, jax.Array]:
-        rows, touches = contact
+        rows, touch = contact
         shape = jax.eval_shape(function, rows)
         zeros = jnp.zeros(shape.shape, shape.dtype)
-        return None, skippable(touches, lambda: function(rows), zeros)
+        return None, skippable(touch, lambda: function(rows), zeros)
 
     return short_scan(apply, None, (rows, is_touching))[1]
 
@@ -182,7 +182,7 @@ def weighted(
                 weights = (pyramid.T * mass) @ pyramid @ basis
                 total = _plus_product(hessian, basis.T[:, None], weights.T[None])
                 return (
-                    jnp.where(group.coupled, total, hessian),
+                    jnp.where(group.coupling, total, hessian),
                     _plus_product(qfrc_constraint, basis.T, pyramid.T @ force),
                 )
 

@@ -148,8 +148,8 @@ def _closest_points(capsule1: GeomInfo, capsule2: GeomInfo) -> tuple[jax.Array, 
     is_parallel = square <= _PARALLEL_SINE_SQUARE * scale
     crossing = jnp.dot(normal, jnp.cross(axis2, offset)) / jnp.where(is_parallel, scale, square)
     # Parallel axes are closest all along their overlap. C has a contact at each of its ends.
-    middle = (meet(-1.0) + meet(1.0)) / 2
-    place1, place2 = jnp.where(is_parallel, middle, meet(jnp.clip(crossing, -1, 1)))
+    midpoint = (meet(-1.0) + meet(1.0)) / 2
+    place1, place2 = jnp.where(is_parallel, midpoint, meet(jnp.clip(crossing, -1, 1)))
     return capsule1.pos + place1 * axis1, capsule2.pos + place2 * axis2
 
 
@@ -224,11 +224,11 @@ def _closest_along(
     levels = jnp.asarray([-1, 1], axis.dtype) * jnp.sqrt(jnp.finfo(axis.dtype).eps)
 
     def halve(span: jax.Array, _: None) -> tuple[jax.Array, None]:
-        middle = (span[0] + span[1]) / 2
-        points = center + middle[:, None] * axis
+        places = (span[0] + span[1]) / 2
+        points = center + places[:, None] * axis
         slope = jax.vmap(lambda point: _from_cylinder(point, size)[1])(points) @ axis
         is_low = slope < levels
-        return jnp.where(is_low, jnp.stack([middle, span[1]]), jnp.stack([span[0], middle])), None
+        return jnp.where(is_low, jnp.stack([places, span[1]]), jnp.stack([span[0], places])), None
 
     # Both bisections at once, [lower and upper end, first and last place].
     span = half * jnp.asarray([[-1, -1], [1, 1]], axis.dtype)
@@ -301,10 +301,10 @@ def one_by_one(collide: Collide) -> Collide:
         if model.npair or not is_written_out():  # pairs have margins of their own
             return collide(model, data, key, geoms)
         geom1, geom2 = geoms.T
-        fields = data.geom_xpos, data.geom_xmat, model.geom_size
+        poses = data.geom_xpos, data.geom_xmat, model.geom_size
         spheres = model.geom_rbound[geom1] + model.geom_rbound[geom2]
         margins = model.geom_margin[geom1] + model.geom_margin[geom2]
-        rows = *(jnp.stack([x[geom1], x[geom2]], 1) for x in fields), spheres, margins
+        rows = *(jnp.stack([x[geom1], x[geom2]], 1) for x in poses), spheres, margins
 
         def collide_pair(
             pos: jax.Array, mat: jax.Array, size: jax.Array, spheres: Any, margin: jax.Array
@@ -349,23 +349,23 @@ _LIKE_C = {
     (mjx.GeomType.CAPSULE, mjx.GeomType.BOX): boxes.capsule_box,
     (mjx.GeomType.BOX, mjx.GeomType.BOX): boxes.box_box,
 }
-_SEARCHED = "which MJX finds in ten steps of a search"
-_FEWER = "of which MJX finds fewer points than C MuJoCo, in other places"
-_OF_MESHES = "SPHERE MESH, CAPSULE MESH, BOX MESH, MESH MESH, PLANE MESH"
-_OF_FIELDS = "HFIELD SPHERE, HFIELD CAPSULE, HFIELD BOX, HFIELD MESH"
-_OF_ELLIPSOIDS = "SPHERE ELLIPSOID, CAPSULE ELLIPSOID, ELLIPSOID ELLIPSOID, ELLIPSOID CYLINDER"
+_SEARCH_REASON = "which MJX finds in ten steps of a search"
+_POINTS_REASON = "of which MJX finds fewer points than C MuJoCo, in other places"
+_MESH_PAIRS = "SPHERE MESH, CAPSULE MESH, BOX MESH, MESH MESH, PLANE MESH"
+_FIELD_PAIRS = "HFIELD SPHERE, HFIELD CAPSULE, HFIELD BOX, HFIELD MESH"
+_ELLIPSOID_PAIRS = "SPHERE ELLIPSOID, CAPSULE ELLIPSOID, ELLIPSOID ELLIPSOID, ELLIPSOID CYLINDER"
 
 
-def _pairs(names: str) -> list[tuple[mjx.GeomType, ...]]:
+def _pairs(pair_names: str) -> list[tuple[mjx.GeomType, ...]]:
     """Returns pairs of types of geoms."""
-    return [tuple(mjx.GeomType[x] for x in pair.split()) for pair in names.split(", ")]
+    return [tuple(mjx.GeomType[x] for x in pair.split()) for pair in pair_names.split(", ")]
 
 
 #: Pairs of types of geoms, in MJX's order, whose contacts are at other places than C's, and how.
 #: ``python -m experiments.checks.contacts`` compares all others with C.
 UNLIKE_C: dict[tuple[mjx.GeomType, ...], str] = {
-    **dict.fromkeys(_pairs(f"{_OF_ELLIPSOIDS}, CYLINDER CYLINDER"), _SEARCHED),
-    **dict.fromkeys(_pairs(f"{_OF_MESHES}, {_OF_FIELDS}"), _FEWER),
+    **dict.fromkeys(_pairs(f"{_ELLIPSOID_PAIRS}, CYLINDER CYLINDER"), _SEARCH_REASON),
+    **dict.fromkeys(_pairs(f"{_MESH_PAIRS}, {_FIELD_PAIRS}"), _POINTS_REASON),
 }
 #: Those that are like C's only without a margin: C leaves out contacts of boxes that an edge keeps
 #: apart by more, and a collision function does not know the margin.
@@ -373,9 +373,9 @@ UNLIKE_C_WITHIN_MARGIN = frozenset(_pairs("BOX BOX"))
 _SOLID_GEOMS = {getattr(mjx.GeomType, x) for x in ("SPHERE", "CAPSULE", "CYLINDER", "BOX")}
 
 
-def _functions(table: dict[Any, Collide]) -> dict[Any, Collide]:
+def _functions(colliders: dict[Any, Collide]) -> dict[Any, Collide]:
     """Returns the collision functions: MJX's, and in their place ours."""
-    functions = table | _LIKE_C
+    functions = colliders | _LIKE_C
     for pair, function in functions.items():
         # A plane has no bounding sphere to compare: its ``geom_rbound`` is zero.
         if set(pair) <= _SOLID_GEOMS:

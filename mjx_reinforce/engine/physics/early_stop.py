@@ -31,7 +31,7 @@ from mjx_reinforce.engine.scalar import is_written_out, short_scan
 _MANY_STEPS = 20
 _MANY_LENGTHS = 50
 #: mjMINVAL: what C takes for zero.
-_TINY = 1e-15
+_MIN_VALUE = 1e-15
 #: The flag for one island, of which MJX has no name.
 _NO_ISLANDS = int(mujoco.mjtDisableBit.mjDSBL_ISLAND)  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -163,7 +163,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.A
         slope_tolerance = tolerance * model.opt.ls_tolerance * norm / scale
         best_mark = _line_search(mark_at, slope_tolerance, model.opt.ls_iterations)
         # A length of zero ends an island's search: it has converged, or there is no better point.
-        length = jnp.where(is_active & (norm >= _TINY), best_mark.length, 0)
+        length = jnp.where(is_active & (norm >= _MIN_VALUE), best_mark.length, 0)
         dof_length = islands.spread(length, islands.dofs)
         row_length = islands.spread(length, islands.rows)
         new_point = newton.Point(
@@ -224,7 +224,7 @@ def _scale(model: mjx.Model, inertia: jax.Array, islands: _Islands) -> jax.Array
     if model.opt.disableflags & _NO_ISLANDS:
         return 1 / jnp.full(1, model.stat.meaninertia * max(1, model.nv), inertia.dtype)
     # Numbers that name no island have a trace of zero.
-    return 1 / jnp.maximum(islands.total(jnp.diagonal(inertia), islands.dofs), _TINY)
+    return 1 / jnp.maximum(islands.total(jnp.diagonal(inertia), islands.dofs), _MIN_VALUE)
 
 
 def _along(
@@ -267,7 +267,7 @@ def _along(
             length=length,
             cost=length * (slope + length * curvature / 2) + work,
             slope=slope + length * curvature - push,
-            curvature=jnp.where(total_curvature > 0, total_curvature, _TINY),
+            curvature=jnp.where(total_curvature > 0, total_curvature, _MIN_VALUE),
         )
 
     return mark_at

@@ -227,9 +227,9 @@ def runge_kutta_4(
     return advance(model, end, act_dot, qacc, qvel).replace(qacc=qacc)
 
 
-def like(new: mjx.Data, old: mjx.Data) -> mjx.Data:
+def like(data: mjx.Data, template: mjx.Data) -> mjx.Data:
     """Returns the new data in the types of the old; MJX makes tendon indices int64 under x64."""
-    return jax.tree.map(lambda x, y: x.astype(y.dtype), new, old)
+    return jax.tree.map(lambda x, y: x.astype(y.dtype), data, template)
 
 
 def _displacement_rate(

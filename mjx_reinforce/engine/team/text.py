@@ -111,13 +111,13 @@ class CText(Backend[str]):
             name, start, stride = spacing
             if stride == int(len(scalars) > 1):  # side by side; that of one scalar is 0
                 return f"({name} + {start})"
-        array = self._reserve(scalars[0].dtype, len(scalars))
-        self.fill(array, scalars)
+        array_id = self._reserve(scalars[0].dtype, len(scalars))
+        self.fill(array_id, scalars)
         self.line("t.sync();")
-        self._read_from(array, scalars)
-        return array
+        self._read_from(array_id, scalars)
+        return array_id
 
-    def fill(self, array: str, scalars: Sequence[Scalar]) -> None:
+    def fill(self, array_id: str, scalars: Sequence[Scalar]) -> None:
         """Writes scalars of the program into an array."""
         self._prepare(scalars)
         # Neighbors of one formula are computed by the lanes together. All are grouped before any is
@@ -127,9 +127,9 @@ class CText(Backend[str]):
         for run in runs:
             if len(run) < _MIN_RUN:
                 for k, x in enumerate(run, start=start):
-                    self.line(f"if (t.lane == 0) {array}[{k}] = {self.value(x, self._values)};")
+                    self.line(f"if (t.lane == 0) {array_id}[{k}] = {self.value(x, self._values)};")
             else:
-                self._each(run, f"{array}[{start} + i] = {{}};")
+                self._each(run, f"{array_id}[{start} + i] = {{}};")
             start += len(run)
 
     def constant(self, number: Any) -> str:
@@ -145,17 +145,17 @@ class CText(Backend[str]):
     def value(self, scalar: Scalar, values: dict[Node, str]) -> str:
         """Returns a scalar, once what it needs is written."""
         # With a stack of its own: a formula may be nested deeper than Python's calls.
-        waiting = [] if is_constant(scalar) else [scalar]
-        while waiting:
-            node = waiting.pop()
+        stack = [] if is_constant(scalar) else [scalar]
+        while stack:
+            node = stack.pop()
             if node in values:
                 continue
             if node.op is None:
                 values[node] = self.leaf(node)
             elif len(terms := self._terms(node)) >= _SHORT_SUM:
                 values[node] = self._sum(_SUMS[node.op.name], node.dtype, terms, values)
-            elif missing := [x for x in node.args if isinstance(x, Node) and x not in values]:
-                waiting += [node, *missing]
+            elif pending := [x for x in node.args if isinstance(x, Node) and x not in values]:
+                stack += [node, *pending]
             else:
                 values[node] = self.node(node, [self.value(x, values) for x in node.args])
         return super().value(scalar, values)
@@ -173,21 +173,21 @@ class CText(Backend[str]):
         groups: dict[np.dtype, list[liveness.Out]] = {}
         for out in gate.outs:
             groups.setdefault(out.leaf.dtype, []).append(out)
-        arrays = [(self._reserve(dtype, len(group)), group) for dtype, group in groups.items()]
+        group_names = [(self._reserve(dtype, len(group)), group) for dtype, group in groups.items()]
         # Both sides fill the same arrays. The body is the first side's; the other side has values
         # of before.
         self.line(f"if ({self.value(gate.predicate, values)}) {{")
         with self._inside(gate.body, {}):
-            for array, group in arrays:
-                self.fill(array, [out.hot for out in group])
+            for array_name, group in group_names:
+                self.fill(array_name, [out.hot for out in group])
         self.line("} else {")
         with self._inside([], {}):
-            for array, group in arrays:
-                self.fill(array, [out.cold for out in group])
+            for array_name, group in group_names:
+                self.fill(array_name, [out.cold for out in group])
         self.lines += ["}", "t.sync();"]
         # Whichever side was taken, its results are at the same places.
-        for array, group in arrays:
-            self._written.update({out.leaf: Place(array, k) for k, out in enumerate(group)})
+        for array_name, group in group_names:
+            self._written.update({out.leaf: Place(array_name, k) for k, out in enumerate(group)})
         return [self.leaf(out.leaf) for out in gate.outs]
 
     def loop(self, loop: LiveLoop, values: dict[Node, str]) -> Sequence[str]:
@@ -201,10 +201,10 @@ class CText(Backend[str]):
             carry_names.append(name)
             local_values[carry.leaf] = name
         rows = [self._row(element.values, values) for element in loop.elements]
-        arrays = []
+        array_names = []
         for record in loop.records:
-            arrays.append(self.name())
-            self.line(f"{type_of(record.value.dtype)} {arrays[-1]}[{loop.length}];")
+            array_names.append(self.name())
+            self.line(f"{type_of(record.value.dtype)} {array_names[-1]}[{loop.length}];")
         count = self.name()
         conditions = []
         if loop.length is not None:
@@ -217,8 +217,8 @@ class CText(Backend[str]):
         # All that is carried is computed before any of it changes: each may read the others.
         next_names = [self.name() for _ in carry_names]
         with self._inside(loop.body, local_values):
-            for record, array in zip(loop.records, arrays, strict=True):
-                self.line(f"{array}[{count}] = {self.get(record.value)};")
+            for record, array_name in zip(loop.records, array_names, strict=True):
+                self.line(f"{array_name}[{count}] = {self.get(record.value)};")
             for carry, next_name in zip(loop.carries, next_names, strict=True):
                 type_name = type_of(carry.leaf.dtype)
                 self.line(f"const {type_name} {next_name} = {self.get(carry.next)};")
@@ -226,8 +226,8 @@ class CText(Backend[str]):
             self.line(f"{name} = {next_name};")
         self.lines += ["t.sync();", "}"]  # the next round may write what this one reads
         entries = list(carry_names)
-        for record, array in zip(loop.records, arrays, strict=True):
-            entries += [f"{array}[{t}]" for t in range(len(record.outs))]
+        for record, array_name in zip(loop.records, array_names, strict=True):
+            entries += [f"{array_name}[{t}]" for t in range(len(record.outs))]
         return entries
 
     def call(self, call: Call, values: dict[Node, str]) -> Sequence[str]:
@@ -308,11 +308,11 @@ class CText(Backend[str]):
         self.words += count * size
         return name
 
-    def _read_from(self, array: str, scalars: Sequence[Scalar]) -> None:
+    def _read_from(self, array_id: str, scalars: Sequence[Scalar]) -> None:
         """Has scalars read from an array from now on."""
         indices = {x: k for k, x in enumerate(scalars) if isinstance(x, Node) and x.op}
-        self._values.update({x: f"{array}[{k}]" for x, k in indices.items()})
-        self._written.update({x: Place(array, k) for x, k in indices.items()})
+        self._values.update({x: f"{array_id}[{k}]" for x, k in indices.items()})
+        self._written.update({x: Place(array_id, k) for x, k in indices.items()})
         self._formulas.forget()  # of what is computed from these, too
 
     def _layer(self, call: Call) -> None:
@@ -348,11 +348,11 @@ class CText(Backend[str]):
         for result_index, (name, units) in enumerate(zip(field_names, call.outs, strict=True)):
             if units and name not in sources:
                 raise UnsupportedPrimitive(f"the task reads {name} of the simulation")
-            array = sources.get(name, "")
+            source = sources.get(name, "")
             if units and not self._simulates_once:  # another operation may overwrite it
-                array = self._reserve(units[0].dtype, len(units))
-                self.line(f"EACH(i, {len(units)}) {array}[i] = {sources[name]}[i];")
-            self._arrays[call, result_index] = array
+                source = self._reserve(units[0].dtype, len(units))
+                self.line(f"EACH(i, {len(units)}) {source}[i] = {sources[name]}[i];")
+            self._arrays[call, result_index] = source
             if units and name in _OUTPUTS:
                 self.reports.append(name.upper())
         self.line("t.sync();")
@@ -371,8 +371,8 @@ class CText(Backend[str]):
         spacing = liveness.evenly_spaced([self._place(x) for x in row])
         if not spacing:
             return None
-        array, start, stride = spacing
-        return lambda count: f"{array}[{start} + {stride} * {count}]"
+        array_id, start, stride = spacing
+        return lambda count: f"{array_id}[{start} + {stride} * {count}]"
 
     def _terms(self, node: Node) -> list[Scalar]:
         """Returns the terms of a sum that the lanes may share; none of what is no such sum."""

@@ -37,12 +37,12 @@ class Window(NamedTuple):
 
     positions: where its elements are while the unknown starts are 0.
     unknowns: the starts that are not constants.
-    inside: whether the constant starts keep it inside the operand.
+    is_inside: whether the constant starts keep it inside the operand.
     """
 
     positions: Array
     unknowns: list[Unknown]
-    inside: bool
+    is_inside: bool
 
 
 def _window(shape: Sequence[int], sizes: Sequence[int], starts: Sequence[Any]) -> Window:
@@ -145,7 +145,7 @@ def _gather_rule(graph: Graph, eqn: Equation, operand: Array, indices: Array) ->
 def _fill_outside(graph: Graph, eqn: Equation, values: Array, window: Window) -> Array:
     """Replaces the values of a window that is outside by the fill value."""
     dtype = np.dtype(eqn.outvars[0].aval.dtype)
-    is_inside = np.bool_(window.inside)
+    is_inside = np.bool_(window.is_inside)
     for index, _, count in window.unknowns:
         low = graph.call("ge", index, index.dtype.type(0))
         high = graph.call("lt", index, index.dtype.type(count))
@@ -190,7 +190,7 @@ def _scatter(graph: Graph, eqn: Equation, *operands: Array, combine: Callable) -
         if _outside_mode(eqn) == "clip":
             start = _clip(graph, start, operand.shape, sizes)
         window = _window(operand.shape, sizes, start)
-        if window.inside:
+        if window.is_inside:
             _write_window(graph, cells, window, block, combine)
     return [arrays.settle(cells.reshape(operand.shape), eqn.outvars[0].aval.dtype)]
 

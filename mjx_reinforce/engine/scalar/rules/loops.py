@@ -327,5 +327,5 @@ def _close(
     return [cold if out is None else out for out, cold in zip(gate.outs, cold_values, strict=True)]
 
 
-def _select_all(graph: Graph, flag: Scalar, hot: list[Scalar], cold: list[Scalar]) -> list[Scalar]:
-    return [graph.select(flag, x, y) for x, y in zip(hot, cold, strict=True)]
+def _select_all(graph: Graph, mask: Scalar, hot: list[Scalar], cold: list[Scalar]) -> list[Scalar]:
+    return [graph.select(mask, x, y) for x, y in zip(hot, cold, strict=True)]
