@@ -11,8 +11,8 @@ WARP = 32
 class Launch(NamedTuple):
     """How a kernel is launched.
 
-    The fields' names are keys of the first line of a kept kernel (``ptx.described``), and their
-    values are macros of CUDA C++ (``Source.for_compiler``).
+    The fields' names are keys of the first line of a kept kernel (``ptx.described``); macros of
+    CUDA C++ have their values, but for ``blocks`` (``Source.for_compiler``).
 
     threads: of a block, at most
     blocks: on a multiprocessor; its registers are as many as that leaves each thread
