@@ -29,8 +29,8 @@ class Arrays:
 
     def __init_subclass__(cls) -> None:
         # In place: the decorator returns the class itself, of which a type checker sees no fields.
-        decorated: Any = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
-        fields = dataclasses.fields(decorated)
+        dataclass: Any = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+        fields = dataclasses.fields(dataclass)
         jax.tree_util.register_dataclass(cls, [field.name for field in fields], [])
 
     def replace(self, **changes: Any) -> Self:
@@ -165,8 +165,8 @@ class Trajectory(Arrays):
 
     def __repr__(self) -> str:
         # Shapes say what it is; the arrays would be pages of numbers.
-        arrays = {"observation": self.observation, "action": self.action, "mask": self.mask}
-        shapes = (f"{name} {x.dtype}{list(x.shape)}" for name, x in arrays.items())
+        leaves = {"observation": self.observation, "action": self.action, "mask": self.mask}
+        shapes = (f"{name} {x.dtype}{list(x.shape)}" for name, x in leaves.items())
         return f"Trajectory({', '.join(shapes)})"
 
     def first(self, steps: int) -> "Trajectory":
@@ -213,17 +213,17 @@ class PhysicsModel(NamedTuple):
 
 
 #: JAX keeps what it traced with one value of this apart from what it traced with another.
-_WHOLE = jax.make_user_context(False)
+_WHOLE_CONTEXT = jax.make_user_context(False)
 
 
 def keeping_whole() -> contextlib.AbstractContextManager[None]:
     """Has an environment that is traced within call ``scalar.whole`` for its physics."""
-    return _WHOLE(True)
+    return _WHOLE_CONTEXT(True)
 
 
 def is_kept_whole() -> bool:
     """Returns whether an operation that a backend may know is to stay whole."""
-    return _WHOLE.value
+    return _WHOLE_CONTEXT.value
 
 
 def shapes(function: Callable[..., Any], *args: PyTree) -> Any:
@@ -260,8 +260,8 @@ def plain(tree: PyTree) -> Any:
     return jax.tree.map(lambda x: jax.random.key_data(x) if is_key(x) else x, tree)
 
 
-def with_keys(tree: PyTree, like: PyTree) -> Any:
-    """Returns a pytree from ``plain`` with keys where ``like`` has them."""
+def with_keys(tree: PyTree, template: PyTree) -> Any:
+    """Returns a pytree from ``plain`` with keys where ``template`` has them."""
     return jax.tree.map(
-        lambda x, old: jax.random.wrap_key_data(x) if is_key(old) else x, tree, like
+        lambda x, y: jax.random.wrap_key_data(x) if is_key(y) else x, tree, template
     )

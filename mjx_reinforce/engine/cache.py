@@ -68,10 +68,10 @@ class Cache(NamedTuple):
         """
         # JAX exports no custom call unless it knows that the target stays what it is. Ours is
         # machine code that is kept beside the program, and ``load`` brings it back.
-        names = (*seam.targets(), *gpu_seam.targets())
-        unsafe = [export.DisabledSafetyCheck.custom_call(x) for x in names]
+        targets = (*seam.targets(), *gpu_seam.targets())
+        checks = [export.DisabledSafetyCheck.custom_call(x) for x in targets]
         try:
-            exported = export.export(jax.jit(program), disabled_checks=unsafe)(*given)
+            exported = export.export(jax.jit(program), disabled_checks=checks)(*given)
             # That list names all code in memory, also of other tasks; ``load`` would ask for it.
             exported = dataclasses.replace(exported, disabled_safety_checks=())
             content = bytes(exported.serialize())

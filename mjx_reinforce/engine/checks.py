@@ -25,7 +25,7 @@ _LIBRARIES = [path.resolve() for path in (*_PYTHON, _PACKAGE, _PACKAGE / "envs")
 #: Characters of somebody else's message that are shown.
 _MAX_MESSAGE = 300
 #: How alike names are, as ``difflib`` counts, of which a third of the letters differ.
-_ALIKE = 0.66
+_MIN_SIMILARITY = 0.66
 #: What every environment has.
 _MEMBERS = ("reset", "step", "action_size")
 
@@ -55,9 +55,9 @@ class BadEnvironmentError(ValueError):
     """An environment's code does not do what an environment must."""
 
 
-def require(holds: object, message: str) -> None:
+def require(condition: object, message: str) -> None:
     """Raises BadEnvironmentError unless something holds."""
-    if not holds:
+    if not condition:
         raise BadEnvironmentError(message)
 
 
@@ -110,8 +110,8 @@ def fits(value: object, kind: object) -> bool:
     # Python's bool is an int; a setting that is a number is not to be True.
     if kind in (int, float) and isinstance(value, bool):
         return False
-    expected = _KINDS[kind].type if kind in _KINDS else kind
-    return not isinstance(expected, type) or isinstance(value, expected)
+    allowed_type = _KINDS[kind].type if kind in _KINDS else kind
+    return not isinstance(allowed_type, type) or isinstance(value, allowed_type)
 
 
 def _fits_tuple(value: object, arguments: tuple[Any, ...]) -> bool:
@@ -239,11 +239,11 @@ def check_parts(env: object) -> None:
     if isinstance(env, type):
         raise BadEnvironmentError(f"{env.__name__} is a class, not an environment yet: call it")
     try:
-        missing = [member for member in _MEMBERS if not hasattr(env, member)]
+        missing_members = [member for member in _MEMBERS if not hasattr(env, member)]
     except Exception as error:  # action_size may be a property, the user's code
         raise BadEnvironmentError(f"{name}.action_size fails: {explain(error)}") from error
-    lacks = f"{name} is not an environment: it has no {', '.join(missing)}"
-    require(not missing, f"{lacks}; mjx_reinforce.Environment says what one has")
+    complaint = f"{name} is not an environment: it has no {', '.join(missing_members)}"
+    require(not missing_members, f"{complaint}; mjx_reinforce.Environment says what one has")
 
 
 def known_number(value: Any) -> float | None:
@@ -275,11 +275,11 @@ def check_number(name: str, value: object, *, positive: bool = False, finite: bo
     raise ValueError(f"{name} must be {kind}, got {value!r}")
 
 
-def check_count(name: str, value: int, least: int = 1) -> None:
-    """Raises ValueError for what is no whole number, or one that is less than ``least``."""
+def check_count(name: str, value: int, minimum: int = 1) -> None:
+    """Raises ValueError for what is no whole number, or one that is less than ``minimum``."""
     check_type(name, value, int)
-    if value < least:
-        raise ValueError(f"{name} must be at least {least}, got {value}")
+    if value < minimum:
+        raise ValueError(f"{name} must be at least {minimum}, got {value}")
 
 
 def check_key(key: object) -> None:
@@ -287,44 +287,44 @@ def check_key(key: object) -> None:
     import jax
 
     dtype = getattr(key, "dtype", None)
-    typed = dtype is not None and jax.numpy.issubdtype(dtype, jax.dtypes.prng_key)
-    if not (typed or dtype == jax.numpy.uint32):
+    is_typed = dtype is not None and jax.numpy.issubdtype(dtype, jax.dtypes.prng_key)
+    if not (is_typed or dtype == jax.numpy.uint32):
         raise ValueError(f"the key must be a random key, such as jax.random.key(0), got {key!r}")
 
 
-def check_name(kind: str, name: str, table: Mapping[str, Any]) -> None:
+def check_name(kind: str, name: str, choices: Mapping[str, Any]) -> None:
     """Raises ValueError for a name that is not in a table, with its names and the nearest of them.
 
     Args:
       kind: what is named, for the message.
       name: what the user typed.
-      table: has the names.
+      choices: has the names.
     """
-    if name in table:
+    if name in choices:
         return
-    near = nearest(name, table)
-    hint = f" Did you mean {near!r}?" if near else ""
-    raise ValueError(f"unknown {kind} {name!r}.{hint} Known: {', '.join(sorted(table))}.")
+    nearest_name = nearest(name, choices)
+    hint = f" Did you mean {nearest_name!r}?" if nearest_name else ""
+    raise ValueError(f"unknown {kind} {name!r}.{hint} Known: {', '.join(sorted(choices))}.")
 
 
-def nearest(name: str, names: Iterable[str]) -> str | None:
+def nearest(name: str, choices: Iterable[str]) -> str | None:
     """Returns the name that somebody meant, whatever the case of the letters, if any is near.
 
     Args:
       name: what the user typed; a name that contains it is near. A version, such as -v5, makes no
         two names alike.
-      names: of versions of one name the last is meant, unless the user typed another.
+      choices: of versions of one name the last is meant, unless the user typed another.
     """
-    typed = _plain(name)
+    query = _plain(name)
     versions: dict[str, list[str]] = {}
-    for candidate in sorted(names):
+    for candidate in sorted(choices):
         versions.setdefault(_plain(candidate), []).append(candidate)
     # Of names that hold what was typed the most alike is meant, however much longer it is.
-    containing = [plain_name for plain_name in versions if len(typed) > 2 and typed in plain_name]
-    if containing:
-        matches = difflib.get_close_matches(typed, containing, n=1, cutoff=0)
+    supernames = [plain_name for plain_name in versions if len(query) > 2 and query in plain_name]
+    if supernames:
+        matches = difflib.get_close_matches(query, supernames, n=1, cutoff=0)
     else:
-        matches = difflib.get_close_matches(typed, versions, n=1, cutoff=_ALIKE)
+        matches = difflib.get_close_matches(query, versions, n=1, cutoff=_MIN_SIMILARITY)
     if not matches:
         return None
     return difflib.get_close_matches(name, versions[matches[0]], n=1, cutoff=0)[0]

@@ -22,11 +22,11 @@ from mjx_reinforce.engine.base import (
 from mjx_reinforce.engine.checks import BadEnvironmentError, require
 
 #: What JAX raises where Python or NumPy asks for the value of a traced array.
-_NEED_VALUES = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
-_TRACED = "; it is compiled by JAX: write jnp.where for `if`, and jnp for numpy, math and float()"
+_VALUE_ERRORS = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
+_ADVICE = "; it is compiled by JAX: write jnp.where for `if`, and jnp for numpy, math and float()"
 #: Ends of names of brax's and Playground's wrappers that map an environment, or reset it where an
 #: episode ends: what the last action led to is lost there.
-_NOT_HERE = ("AutoResetWrapper", "VmapWrapper")
+_FOREIGN_WRAPPERS = ("AutoResetWrapper", "VmapWrapper")
 
 
 def check_environment(env: Environment) -> None:
@@ -42,8 +42,8 @@ def check_environment(env: Environment) -> None:
     _check_action_space(name, env)
     start = _shapes(name, "reset", env.reset, jax.random.key(0))
     _check_state(name, start)
-    after = _shapes(name, "step", env.step, start, _action_shape(env))
-    _check_same(name, start, after)
+    next_shapes = _shapes(name, "step", env.step, start, _action_shape(env))
+    _check_same(name, start, next_shapes)
 
 
 def _check_wrappers(env: object) -> None:
@@ -52,7 +52,7 @@ def _check_wrappers(env: object) -> None:
     while wrapper is not None:
         name = type(wrapper).__name__
         require(
-            not name.endswith(_NOT_HERE),
+            not name.endswith(_FOREIGN_WRAPPERS),
             f"{name} does what is done here: give the environment that it wraps, its env, "
             "as brax.envs.create(..., auto_reset=False) makes it",
         )
@@ -130,7 +130,7 @@ def _shapes(name: str, method: str, function: Callable[..., Any], *arguments: Py
     except BadEnvironmentError:
         raise
     except (Exception, SystemExit) as error:  # it is the user's code, which may raise anything
-        remedy = _TRACED if isinstance(error, _NEED_VALUES) else ""
+        remedy = _ADVICE if isinstance(error, _VALUE_ERRORS) else ""
         raise BadEnvironmentError(
             f"{name}.{method} fails: {checks.explain(error)}{remedy}"
         ) from error
@@ -150,43 +150,43 @@ def _check_state(name: str, start: PyTree) -> None:
         ("done", 0, "a scalar []", "reduce it, as with jnp.any"),
     ):
         value = getattr(start, field, None)
-        fault = f"there is no {field}" if value is None else f"it is {described(value)}"
+        complaint = f"there is no {field}" if value is None else f"it is {described(value)}"
         require(
             hasattr(value, "shape"),
-            f"{name}.reset must return a state whose {field} is {shape}, and {fault}; "
+            f"{name}.reset must return a state whose {field} is {shape}, and {complaint}; "
             "brax.envs.State has all that is needed",
         )
-        array: Any = value
-        sizes = list(array.shape)
+        leaf: Any = value
+        sizes = list(leaf.shape)
         # An axis without entries would give a policy nothing to see.
         require(
             len(sizes) == axes and 0 not in sizes,
             f"the {field} of {name}.reset must be {shape}, its shape is {sizes}; {remedy}",
         )
         require(
-            jnp.isrealobj(array),
-            f"the {field} of {name}.reset must hold real numbers, it holds {array.dtype}",
+            jnp.isrealobj(leaf),
+            f"the {field} of {name}.reset must hold real numbers, it holds {leaf.dtype}",
         )
 
 
-def _check_same(name: str, start: PyTree, after: PyTree) -> None:
+def _check_same(name: str, start: PyTree, next_shapes: PyTree) -> None:
     """Raises ValueError if ``step`` returns a state of another kind than ``reset``."""
     reset_leaves = _paths(start)
-    step_leaves = _paths(after)
-    unpaired = [f"{path} only after reset" for path in reset_leaves if path not in step_leaves]
-    unpaired += [f"{path} only after step" for path in step_leaves if path not in reset_leaves]
+    step_leaves = _paths(next_shapes)
+    orphans = [f"{path} only after reset" for path in reset_leaves if path not in step_leaves]
+    orphans += [f"{path} only after step" for path in step_leaves if path not in reset_leaves]
     # Trees of the same leaves may still differ, as a tuple and a list do.
     message = f"{name}.step must return a state with the entries that reset's has"
-    if unpaired:
-        message = f"{message}: {', '.join(unpaired[:4])}"
-    require(jax.tree.structure(start) == jax.tree.structure(after), message)
-    for (path, old), new in zip(reset_leaves.items(), step_leaves.values(), strict=True):
+    if orphans:
+        message = f"{message}: {', '.join(orphans[:4])}"
+    require(jax.tree.structure(start) == jax.tree.structure(next_shapes), message)
+    for (path, x), y in zip(reset_leaves.items(), step_leaves.values(), strict=True):
         # May a new value be kept in place of an old one, as ``hold`` does?
-        holds = old.dtype == new.dtype or jnp.promote_types(old.dtype, new.dtype) == old.dtype
+        is_kept = x.dtype == y.dtype or jnp.promote_types(x.dtype, y.dtype) == x.dtype
         require(
-            old.shape == new.shape and holds,
-            f"{name}.step must return a state like reset's: {path} is {described(old)} after "
-            f"reset, and {described(new)} after step",
+            x.shape == y.shape and is_kept,
+            f"{name}.step must return a state like reset's: {path} is {described(x)} after "
+            f"reset, and {described(y)} after step",
         )
 
 
@@ -247,8 +247,8 @@ def check_shape(name: str, value: object, *shapes: tuple[int, ...], remedy: str 
       remedy: what to do instead, for the message.
     """
     if shape_of(value) not in shapes:
-        expected = " or ".join(str(list(shape)) for shape in shapes)
-        raise ValueError(f"{name} must be {expected}, got {in_words(value)}{remedy}")
+        shape_words = " or ".join(str(list(shape)) for shape in shapes)
+        raise ValueError(f"{name} must be {shape_words}, got {in_words(value)}{remedy}")
 
 
 def shape_of(value: Any) -> tuple[int, ...] | None:

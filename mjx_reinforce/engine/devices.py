@@ -13,7 +13,7 @@ from mjx_reinforce.engine.memory import gigabytes, host_memory
 _AXIS = "devices"
 #: XLA tries kernels for each product of matrices until it has the fastest, and which it takes may
 #: differ from run to run. On an H100 Humanoid compiled in 9 s without trials, in 51 s with them.
-_ON_GPU = {"xla_gpu_enable_triton_gemm": False, "xla_gpu_autotune_level": 0}
+_GPU_OPTIONS = {"xla_gpu_enable_triton_gemm": False, "xla_gpu_autotune_level": 0}
 #: The first axis is divided among the devices, such as that of the runs; the second is; none is.
 RUNS = PartitionSpec(_AXIS)
 SECOND = PartitionSpec(None, _AXIS)
@@ -28,12 +28,12 @@ def memory_here() -> float:
     return float((device.memory_stats() or {}).get("bytes_limit", float("inf")))
 
 
-def check_room(needed: float) -> None:
+def check_room(num_bytes: float) -> None:
     """Raises ValueError if so many bytes are not there."""
     memory = memory_here()
-    if needed > memory:
+    if num_bytes > memory:
         raise ValueError(
-            f"this does not fit into memory: it needs about {gigabytes(needed)}, "
+            f"this does not fit into memory: it needs about {gigabytes(num_bytes)}, "
             f"{gigabytes(memory)} are here; lower --num-seeds (of a sweep --chunk-runs), "
             "--num-episodes, --eval-episodes, --hidden-sizes, --value-hidden-sizes or --horizon"
         )
@@ -41,7 +41,7 @@ def check_room(needed: float) -> None:
 
 def executable(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
     """Returns a compiled program, on a GPU without trials of kernels."""
-    options = _ON_GPU if jax.default_backend() == "gpu" else None
+    options = _GPU_OPTIONS if jax.default_backend() == "gpu" else None
     return lowered.compile(compiler_options=options)
 
 
@@ -80,8 +80,8 @@ class Devices:
         """Returns ``map`` of a function, compiled."""
         # Said again: arrays without entries would else be on all devices.
         shardings = self.shardings(out_specs)
-        mapped = self.map(function, in_specs, out_specs)
-        return jax.jit(mapped, out_shardings=shardings)
+        mapped_function = self.map(function, in_specs, out_specs)
+        return jax.jit(mapped_function, out_shardings=shardings)
 
     def shardings(self, specs: Any) -> Any:
         """Returns how arrays are divided, for JAX."""

@@ -121,28 +121,28 @@ def step(
     action = distribution.sample(outputs, noise)
     if deterministic is not None:
         action = _choose(deterministic, distribution.mode(outputs), action)
-    after = env_step(state, action.T)
+    next_state = env_step(state, action.T)
     # An episode that is over is stepped too, by an action that nobody sees: it cannot break.
-    finite = jnp.all(jnp.isfinite(after.obs), axis=0)
-    finite &= jnp.isfinite(after.reward) & jnp.isfinite(after.done)
-    broken = alive & ~finite
+    is_finite = jnp.all(jnp.isfinite(next_state.obs), axis=0)
+    is_finite &= jnp.isfinite(next_state.reward) & jnp.isfinite(next_state.done)
+    is_broken = alive & ~is_finite
     return Step(
         observation=observation,
         action=_choose(alive, action, jnp.zeros_like(action)),
-        reward=jnp.where(alive & ~broken, after.reward, 0.0),
-        alive=alive & ~broken & (after.done == 0),
-        broken=broken,
-        state=after,
+        reward=jnp.where(alive & ~is_broken, next_state.reward, 0.0),
+        alive=alive & ~is_broken & (next_state.done == 0),
+        broken=is_broken,
+        state=next_state,
     )
 
 
-def hold(alive: jax.Array, after: PyTree, before: PyTree) -> Any:
-    """Returns ``after`` where an episode is running, and ``before`` where it is over.
+def hold(is_alive: jax.Array, new_state: PyTree, old_state: PyTree) -> Any:
+    """Returns ``new_state`` where an episode is running, and ``old_state`` where it is over.
 
     So a finished episode keeps its last state. Otherwise its state could run off to infinity,
     where MJX's own constraint solver needs all its iterations.
     """
-    return jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, before)
+    return jax.tree.map(lambda x, y: jnp.where(is_alive, x, y), new_state, old_state)
 
 
 def _choose(mask: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
@@ -161,9 +161,9 @@ def while_any(
     return lax.while_loop(lambda carry: any_lane(cond(carry)), body, init)
 
 
-def largest_divisor(number: int, at_most: int) -> int:
-    """Returns the largest divisor of ``number`` that is no greater than ``at_most``."""
-    return max(d for d in range(1, min(number, at_most) + 1) if number % d == 0)
+def largest_divisor(number: int, limit: int) -> int:
+    """Returns the largest divisor of ``number`` that is no greater than ``limit``."""
+    return max(d for d in range(1, min(number, limit) + 1) if number % d == 0)
 
 
 def chunk_length(horizon: int) -> int:
@@ -201,9 +201,9 @@ def play_chunks(
         # Noise for all lanes and the whole chunk, also of episodes that end in it: an episode's
         # keys depend on nothing but how many chunks were played.
         keys, noise = draw(keys)
-        progress, new = play(noise, progress)
+        progress, steps = play(noise, progress)
         records = jax.tree.map(
-            lambda old, x: lax.dynamic_update_slice_in_dim(old, x, chunk * length, 0), records, new
+            lambda y, x: lax.dynamic_update_slice_in_dim(y, x, chunk * length, 0), records, steps
         )
         return chunk + 1, keys, progress, records
 

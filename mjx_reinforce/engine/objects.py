@@ -102,8 +102,8 @@ def source_digest(*packages: str) -> str:
     digest = hashlib.sha256()
     for name in packages:
         with resources.as_file(resources.files(name)) as folder:
-            for place, _, names in sorted(os.walk(folder, followlinks=True)):
-                for file in sorted(names):
+            for place, _, file_names in sorted(os.walk(folder, followlinks=True)):
+                for file in sorted(file_names):
                     if file.endswith((".py", ".ll", ".h", ".xml")):
                         digest.update(Path(place, file).read_bytes())
     return digest.hexdigest()

@@ -16,7 +16,7 @@ import scipy.special
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.gpu import ptx, seam
 from mjx_reinforce.engine.gpu.kernel import ENTRY
-from mjx_reinforce.engine.gpu.source import Facts
+from mjx_reinforce.engine.gpu.source import Launch
 from mjx_reinforce.engine.play import available
 
 #: A compiler of C++, if there is one.
@@ -99,7 +99,7 @@ def compiled_team(source):
         library = f"{folder}/play.so"
         options = ("-std=c++17", "-O1", "-shared", "-fPIC", "-w", "-DREAL=float", "-x", "c++", "-")
         address = ctypes.cast(_ERFINV, ctypes.c_void_p).value
-        text = source._replace(facts=source.facts._replace(lanes=1)).for_compiler()
+        text = source._replace(launch=source.launch._replace(lanes=1)).for_compiler()
         text = f"#define erfinvf(x) ((float (*)(float)){address}ull)(x)\n{text}"
         done = subprocess.run([COMPILER, *options, "-o", library], input=text, text=True)
         assert done.returncode == 0
@@ -127,14 +127,16 @@ def emulate(monkeypatch, threads=1, block=None):
         assert capability == "9.0"
         assert folder is None or folder.name == "native"
         written = write()
-        facts = written.facts
+        launch = written.launch
         if written.language == "cuda":
             # The scratch of a team is that of its one lane.
-            facts = facts._replace(scratch=facts.scratch * facts.lanes)
+            launch = launch._replace(scratch=launch.scratch * launch.lanes)
             address = compiled_team(written)
-            return ptx.Kernel(source, "cuda", str(address), facts, compiled=True)
+            return ptx.Kernel(source, "cuda", str(address), launch, compiled=True)
         code = compiled(written.text, block)
-        return ptx.Kernel(code.key, "ptx", str(code.addresses[ENTRY]), Facts(256, 1), compiled=True)
+        return ptx.Kernel(
+            code.key, "ptx", str(code.addresses[ENTRY]), Launch(256, 1), compiled=True
+        )
 
     def call(kernel, grid, given, first, results):
         size = 32 * -(-threads // 32)
@@ -142,7 +144,7 @@ def emulate(monkeypatch, threads=1, block=None):
         def run(*given):
             given = [np.array(x, order="C") for x in given]
             made = [np.full(x.shape, 0 if first else 77, x.dtype) for x in results]
-            words = kernel.facts.scratch * size
+            words = kernel.launch.scratch * size
             scratch = [np.full(words, np.nan, np.float32)] * bool(words)
             run_threads(int(kernel.text), threads, [*given, *made * bool(first), *made, *scratch])
             return made

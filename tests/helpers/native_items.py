@@ -11,7 +11,7 @@ import numpy as np
 from mjx_reinforce.engine.cpu import handler, machine, seam
 
 N, T = 3, 5
-_FIELD = {name: number for number, name in enumerate(handler.FIELDS)}
+_FIELD = {name: number for number, name in enumerate(handler.JOB)}
 
 
 def text(lanes=1):
@@ -28,7 +28,7 @@ def text(lanes=1):
 
 def load(folder=None, lanes=1, level=None):
     return machine.load_module(
-        text(lanes), lambda: text(lanes), handler.NAMES, machine.this_machine(level), folder
+        text(lanes), lambda: text(lanes), handler.SYMBOLS, machine.this_machine(level), folder
     )
 
 

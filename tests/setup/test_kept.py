@@ -24,7 +24,7 @@ from mjx_reinforce.engine import cache, objects
 from mjx_reinforce.engine.cpu import machine, seam
 from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.gpu import seam as gpu
-from mjx_reinforce.engine.gpu.source import Facts
+from mjx_reinforce.engine.gpu.source import Launch
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup import compile_times, ready
 
@@ -43,7 +43,7 @@ def filled(tmp_path_factory):
     made = tmp_path_factory.mktemp("kept")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(objects, "folder", lambda: made)
-        patch.setattr(machine, "_LOADED", {})  # as in a process that has loaded nothing
+        patch.setattr(machine, "_CACHE", {})  # as in a process that has loaded nothing
         return made, numbers(ready.load_or_build_ready(CONFIG, CONFIG), CONFIG)
 
 
@@ -128,8 +128,8 @@ def test_programs_depend_on_what_jax_is_told(monkeypatch):
 
 
 def test_a_program_that_launches_a_gpus_kernel_is_kept(monkeypatch):
-    kernel = ptx.Kernel("0" * 64, "ptx", "", Facts(threads=1, blocks=1), compiled=True)
-    monkeypatch.setattr(ptx, "_LOADED", {kernel.key: kernel})
+    kernel = ptx.Kernel("0" * 64, "ptx", "", Launch(threads=1, blocks=1), compiled=True)
+    monkeypatch.setattr(ptx, "_CACHE", {kernel.key: kernel})
     monkeypatch.setattr(gpu, "_handler", lambda kernel: gpu._target(kernel.key))
     monkeypatch.setattr(gpu, "_assemblers", lambda: ((), None))
 
@@ -172,11 +172,11 @@ def test_resumed_runs_and_other_seeds_find_their_programs(expected, monkeypatch)
 def test_what_is_damaged_is_made_again(expected, folder, monkeypatch):
     whole = {path: path.read_bytes() for path in folder.iterdir()}
     for name in ("facts", "advance", ""):  # the last is the machine code
-        monkeypatch.setattr(machine, "_LOADED", {})
+        monkeypatch.setattr(machine, "_CACHE", {})
         for path, content in whole.items():
             path.write_bytes(content)
         assert ready.load_ready(ready.key_of(CONFIG)) is not None
-        monkeypatch.setattr(machine, "_LOADED", {})
+        monkeypatch.setattr(machine, "_CACHE", {})
         (path,) = (path for path in whole if path.stem.partition("-")[2] == name)
         path.write_bytes(whole[path][:-1])
         assert ready.load_ready(ready.key_of(CONFIG)) is None, name

@@ -17,9 +17,9 @@ Result = TypeVar("Result")
 _PROCESSES: list[subprocess.Popen[bytes]] = []
 _THREADS: list[threading.Thread] = []
 #: Held while a process starts.
-_STARTING = threading.Lock()
+_START_LOCK = threading.Lock()
 #: Set when this process ends: from then on none starts.
-_ENDS = threading.Event()
+_EXIT_EVENT = threading.Event()
 
 
 def target_machine(triple: str, cpu: str, features: str, effort: int) -> Any:
@@ -50,8 +50,8 @@ def elsewhere(text: str, triple: str, cpu: str, features: str, effort: int) -> b
     # With -P this file's folder is not the first in which Python looks for modules.
     command = [sys.executable, "-P", __file__, triple, cpu, features, str(effort)]
     pipe = subprocess.PIPE
-    with _STARTING:
-        if _ENDS.is_set():
+    with _START_LOCK:
+        if _EXIT_EVENT.is_set():
             raise RuntimeError("this process ends")
         # In a session of its own: Ctrl-C asks a run to stop, which still needs its code for that.
         try:
@@ -71,13 +71,13 @@ def elsewhere(text: str, triple: str, cpu: str, features: str, effort: int) -> b
     return data
 
 
-def later(work: Callable[[], Result]) -> Future[Result]:
-    """Returns what ``work`` will return, in a thread of its own."""
+def later(task: Callable[[], Result]) -> Future[Result]:
+    """Returns what ``task`` will return, in a thread of its own."""
     future: Future[Result] = Future()
 
     def do() -> None:
         try:
-            future.set_result(work())
+            future.set_result(task())
         except BaseException as error:  # whatever it is, who waits gets it
             future.set_exception(error)
 
@@ -90,8 +90,8 @@ def later(work: Callable[[], Result]) -> Future[Result]:
 @atexit.register
 def end_processes() -> None:
     """Ends LLVM's processes when this one ends; no other starts any more."""
-    with _STARTING:
-        _ENDS.set()
+    with _START_LOCK:
+        _EXIT_EVENT.set()
         for process in _PROCESSES:
             process.kill()
     # Their processes are gone, so they return at once; none is left in LLVM while Python ends.

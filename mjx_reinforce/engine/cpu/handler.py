@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 
 from mjx_reinforce.engine.llvm.text import Text
 
-_TEXT = Path(__file__).with_name("handler.ll")
+_HANDLER = Path(__file__).with_name("handler.ll")
 #: What every handler begins with.
 _ENTRY = Path(__file__).with_name("entry.ll")
 #: The functions to be called from outside; tests call others.
-NAMES = ("handler",)
+SYMBOLS = ("handler",)
 #: The fields of a job, %Job.
-FIELDS = (
+JOB = (
     "refs",  # i64: who may still look at the job; the last one frees it
     "running",  # i64: threads of the pool that work
     "next",  # i64: the item to be fetched next
@@ -78,7 +78,7 @@ def handler_text(
     result_bytes: Sequence[int],
     lanes: int = 1,
     positions: Positions = EPISODES,
-    zeroed: bool = True,
+    is_zeroed: bool = True,
 ) -> str:
     """Returns the IR of all but ``@work``; it defines %Job.
 
@@ -93,16 +93,16 @@ def handler_text(
       simulated [*B] int32.
       lanes: the items that a thread plays at once; fewer are not worth a thread.
       positions: where other arguments and results than these have their sizes.
-      zeroed: whether results are zero when ``@work`` begins.
+      is_zeroed: whether results are zero when ``@work`` begins.
     """
     num_results = len(result_bytes)
     # A job is one piece of memory: its fields, the buffers' addresses, the results' sizes.
-    job_bytes = 8 * len(FIELDS)
+    job_bytes = 8 * len(JOB)
     data_bytes = 8 * (num_args + num_results)
     sizes_bytes = 8 * num_results
-    values: dict[str, Any] = {field: f"i32 0, i32 {number}" for number, field in enumerate(FIELDS)}
+    values: dict[str, Any] = {field: f"i32 0, i32 {number}" for number, field in enumerate(JOB)}
     values |= {
-        "job": ", ".join("ptr" if field in _POINTERS else "i64" for field in FIELDS),
+        "job": ", ".join("ptr" if field in _POINTERS else "i64" for field in JOB),
         "num_args": num_args,
         "num_results": num_results,
         "num_buffers": num_args + num_results,
@@ -116,9 +116,9 @@ def handler_text(
         "threads_arg": positions.threads,
         "items_arg": positions.items,
         "steps_ret": positions.steps,
-        "zeroed": int(zeroed),
+        "zeroed": int(is_zeroed),
     }
-    return with_entry(_TEXT, values)
+    return with_entry(_HANDLER, values)
 
 
 def with_entry(file: Path, values: Mapping[str, Any]) -> str:
@@ -136,7 +136,7 @@ class JobText:
 
     def field(self, name: str) -> str:
         """Returns the pointer to a field of the job."""
-        number = FIELDS.index(name)
+        number = JOB.index(name)
         return self.text.let(f"getelementptr inbounds %Job, ptr %job, i32 0, i32 {number}")
 
     def job(self, name: str, kind: str) -> str:

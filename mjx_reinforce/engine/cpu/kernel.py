@@ -31,7 +31,7 @@ from mjx_reinforce.engine.scalar.jaxprs import num_entries
 #: size, as LLVM takes for granted.
 ALIGNMENT = 128
 #: Loops of a large model hold more between them than a thread's stack has room for.
-_MOST_ON_STACK = 2**20
+_MAX_STACK = 2**20
 
 
 #: The buffers of a call: so many arguments of its own, those of the actor and the state, the
@@ -39,10 +39,10 @@ _MOST_ON_STACK = 2**20
 NUM_CONTROLS = 3
 NUM_RECORDS = 3
 #: The results behind the records that ``@finish`` writes.
-_LENGTH = 3
-_BROKEN = 4
+_LENGTH_RESULT = 3
+_BROKEN_RESULT = 4
 #: What the queue looks at of a lane.
-_OF_LANES = ("alive", "seed", "episode", "step", "limit", "broken", "counted")
+_LANE_FIELDS = ("alive", "seed", "episode", "step", "limit", "broken", "counted")
 _QUEUE = Path(__file__).with_name("queue.ll")
 
 
@@ -117,7 +117,7 @@ def layout(leaves: list[Any], num_actor: int, lanes: int) -> VectorLayout:
         return Field(offset, np.dtype(dtype), entries)
 
     inputs = [field(x.dtype, int(np.prod(x.shape, dtype=int))) for x in leaves]
-    *state, keys, step, deterministic, alive = inputs[num_actor:]
+    *state, keys, step, deterministic, alive_mask = inputs[num_actor:]
     return VectorLayout(
         inputs=inputs,
         actor=[x for x in inputs[:num_actor] if x.entries],
@@ -126,7 +126,7 @@ def layout(leaves: list[Any], num_actor: int, lanes: int) -> VectorLayout:
         key=keys._replace(entries=2),
         step=step,
         deterministic=deterministic,
-        alive=alive,
+        alive=alive_mask,
         broken=field(np.int32, 1),
         limit=field(np.int32, 1),
         seed=field(np.int64, 1),
@@ -151,15 +151,15 @@ def queue_text(places: VectorLayout, lanes: int) -> str:
         _copy(f"state{i}", field, first_state + i, "%item") for i, field in enumerate(places.state)
     ]
     copies_of_state.append(_copy("keys", places.key, handler.KEYS, "%item"))
-    values = {name: f"i32 0, i32 {number}" for number, name in enumerate(handler.FIELDS)}
+    values = {name: f"i32 0, i32 {number}" for number, name in enumerate(handler.JOB)}
     values |= {
         "lanes": str(lanes),
         "deterministic_at": _lane("%mode.lane", places.deterministic),
-        **{f"{x}_at": _lane(f"%{x}.at", getattr(places, x)) for x in _OF_LANES},
+        **{f"{x}_at": _lane(f"%{x}.at", getattr(places, x)) for x in _LANE_FIELDS},
         "limits_arg": str(handler.LIMITS),
         "not_played": str(NOT_PLAYED),
-        "length_data": str(first_result + _LENGTH),
-        "broken_data": str(first_result + _BROKEN),
+        "length_data": str(first_result + _LENGTH_RESULT),
+        "broken_data": str(first_result + _BROKEN_RESULT),
         "simulated_data": str(first_result + handler.SIMULATED),
         "copy_actor": "\n".join(copies_of_actor),
         "copy_state": "\n".join(copies_of_state),
@@ -193,8 +193,8 @@ def _copy(name: str, field: Field, buffer: int, row: str) -> str:
     return "\n".join(f"  {line}" for line in lines)
 
 
-_INT = np.dtype(np.int32)
-_LONG = np.dtype(np.int64)
+_INT32 = np.dtype(np.int32)
+_INT64 = np.dtype(np.int64)
 
 
 def kernel_text(step: scalarized.Scalarized, num_actor: int, lanes: int) -> str:
@@ -206,8 +206,8 @@ def kernel_text(step: scalarized.Scalarized, num_actor: int, lanes: int) -> str:
       lanes: how many lanes a vector has.
     """
     places = layout(step.in_avals, num_actor, lanes)
-    work = _Work(Text(lanes, _MOST_ON_STACK), places, num_actor)
-    return queue_text(places, lanes) + work.write(step)
+    writer = _Work(Text(lanes, _MAX_STACK), places, num_actor)
+    return queue_text(places, lanes) + writer.write(step)
 
 
 class _Work(handler.JobText):
@@ -236,10 +236,10 @@ class _Work(handler.JobText):
         """Returns the function that plays with a step."""
         text = self.text
         text.line("%control = call i64 @flush()")
-        text.store(text.constant(np.int64(-1)), self.seed, _LONG)  # a lane's first seed is new
+        text.store(text.constant(np.int64(-1)), self.seed, _INT64)  # a lane's first seed is new
         for lane in range(text.lanes):
             text.line(f"call void @begin(ptr %job, ptr {self.memory}, i64 {lane})")
-        entry = text.block
+        entry_block = text.block
         head = text.label()
         body = text.label()
         end = text.label()
@@ -248,12 +248,12 @@ class _Work(handler.JobText):
         # The body may end in another block than it begins in, which is known behind it: the phi
         # that counts iterations is filled in then.
         iterations = text.hole()
-        alive = self._is_set(text.load(self.alive, _INT))
-        text.line(f"br i1 {text.any(alive)}, label %{body}, label %{end}")
+        alive_mask = self._is_set(text.load(self.alive, _INT32))
+        text.line(f"br i1 {text.any(alive_mask)}, label %{body}, label %{end}")
         text.start(body)
-        self._finish(self._play(step, alive))
+        self._finish(self._play(step, alive_mask))
         next_iterations = text.let(f"add i64 {iterations.name}, 1")
-        text.fill(iterations, f"phi i64 [0, %{entry}], [{next_iterations}, %{text.block}]")
+        text.fill(iterations, f"phi i64 [0, %{entry_block}], [{next_iterations}, %{text.block}]")
         text.line(f"br label %{head}")
         text.start(end)
         for lane in range(text.lanes):
@@ -264,40 +264,40 @@ class _Work(handler.JobText):
         text.leave()
         return text.function("void @work(ptr %job)")
 
-    def _play(self, step: scalarized.Scalarized, alive: str) -> str:
+    def _play(self, step: scalarized.Scalarized, alive_mask: str) -> str:
         """Writes a step of all lanes; returns which of them have ended their episode by it."""
         text = self.text
-        fields = self.places.inputs
-        emit = LLVM(text, lambda number: Input(self.inputs[number], fields[number].dtype))
+        slots = self.places.inputs
+        emit = LLVM(text, lambda number: Input(self.inputs[number], slots[number].dtype))
         values = emit.compile(step.schedule, step.outputs)
         # Now, while the lanes' numbers of steps are still those of this step.
-        self._record(values[:NUM_RECORDS], step.out_avals, alive)
-        (goes_on,), (broken,), *carried = values[NUM_RECORDS:]
+        self._record(values[:NUM_RECORDS], step.out_avals, alive_mask)
+        (is_going_on,), (is_broken,), *carries = values[NUM_RECORDS:]
         # The state and the keys lie behind the actor, in the order in which a step returns them. A
         # lane without an episode carries on, too: nothing reads it before another one begins.
         pointers = self.inputs[self.num_actor :]
-        for leaf, pointer, field in zip(carried, pointers, fields[self.num_actor :], strict=False):
+        for leaf, pointer, field in zip(carries, pointers, slots[self.num_actor :], strict=False):
             for k, value in enumerate(leaf):
                 text.store(value, text.at(pointer, field.dtype, k), field.dtype)
-        kind = text.type(_INT)
+        kind = text.type(_INT32)
         increment = text.constant(np.int32(1))
-        steps = text.let(f"add {kind} {text.load(self.step, _INT)}, {increment}")
-        text.store(steps, self.step, _INT)
-        text.store(broken, self.broken, _INT)
-        late = text.let(f"icmp sge {kind} {steps}, {text.load(self.limit, _INT)}")
+        steps = text.let(f"add {kind} {text.load(self.step, _INT32)}, {increment}")
+        text.store(steps, self.step, _INT32)
+        text.store(is_broken, self.broken, _INT32)
+        is_late = text.let(f"icmp sge {kind} {steps}, {text.load(self.limit, _INT32)}")
         bools = text.type(bool)
-        true = text.constant(np.True_)
-        stops = text.let(f"xor {bools} {self._is_set(goes_on)}, {true}")
-        stops = text.let(f"or {bools} {stops}, {late}")
-        return text.let(f"and {bools} {stops}, {alive}")
+        true_lanes = text.constant(np.True_)
+        is_stopping = text.let(f"xor {bools} {self._is_set(is_going_on)}, {true_lanes}")
+        is_stopping = text.let(f"or {bools} {is_stopping}, {is_late}")
+        return text.let(f"and {bools} {is_stopping}, {alive_mask}")
 
-    def _record(self, records: list[Any], avals: list[Any], alive: str) -> None:
+    def _record(self, records: list[Any], avals: list[Any], alive_mask: str) -> None:
         """Writes observation, action and reward into results [S, T, N, ...]."""
         text = self.text
-        kind = text.type(_LONG)
-        seed = text.load(self.seed, _LONG)
-        episode = text.load(self.episode, _LONG)
-        step = text.let(f"sext {text.type(_INT)} {text.load(self.step, _INT)} to {kind}")
+        kind = text.type(_INT64)
+        seed = text.load(self.seed, _INT64)
+        episode = text.load(self.episode, _INT64)
+        step = text.let(f"sext {text.type(_INT32)} {text.load(self.step, _INT32)} to {kind}")
         horizon = text.broadcast("i64", self.horizon)
         episodes = text.broadcast("i64", self.episodes)
         # In 64 bits: the numbers of a sweep's records may be more than 2^31.
@@ -305,18 +305,18 @@ class _Work(handler.JobText):
         row = text.let(f"add {kind} {row}, {step}")
         row = text.let(f"mul {kind} {row}, {episodes}")
         row = text.let(f"add {kind} {row}, {episode}")
-        for values, result, aval in zip(records, self.records, avals, strict=False):
+        for values, pointer, aval in zip(records, self.records, avals, strict=False):
             start = text.let(f"mul {kind} {row}, {text.constant(np.int64(len(values)))}")
             for k, value in enumerate(values):
                 index = text.let(f"add {kind} {start}, {text.constant(np.int64(k))}")
-                text.scatter(value, result, index, alive, aval.dtype)
+                text.scatter(value, pointer, index, alive_mask, aval.dtype)
 
-    def _finish(self, ended: str) -> None:
+    def _finish(self, end_mask: str) -> None:
         """Writes what is done for the lanes whose episode has ended."""
         text = self.text
         # Most steps end no episode: one test of all lanes skips a test of each.
-        with text.when(text.any(ended)):
-            mask = text.mask(ended)
+        with text.when(text.any(end_mask)):
+            mask = text.mask(end_mask)
             for lane in range(text.lanes):
                 with text.when(text.bit(mask, lane)):
                     text.line(f"call void @finish(ptr %job, ptr {self.memory}, i64 {lane})")
@@ -327,10 +327,10 @@ class _Work(handler.JobText):
         size = self.places.size
         # On the heap: of a large model it is more than XLA's threads have on their stacks.
         room = text.let(f"call ptr @malloc(i64 {size + ALIGNMENT})")
-        number = text.let(f"ptrtoint ptr {room} to i64")
-        number = text.let(f"add i64 {number}, {ALIGNMENT - 1}")
-        number = text.let(f"and i64 {number}, {-ALIGNMENT}")
-        memory = text.let(f"inttoptr i64 {number} to ptr")
+        address = text.let(f"ptrtoint ptr {room} to i64")
+        address = text.let(f"add i64 {address}, {ALIGNMENT - 1}")
+        address = text.let(f"and i64 {address}, {-ALIGNMENT}")
+        memory = text.let(f"inttoptr i64 {address} to ptr")
         text.line(f"call void @llvm.memset.p0.i64(ptr {memory}, i8 0, i64 {size}, i1 false)")
         return room, memory
 
@@ -339,45 +339,45 @@ class _Work(handler.JobText):
 
     def _is_set(self, flag: str) -> str:
         zero = self.text.constant(np.int32(0))
-        return self.text.let(f"icmp ne {self.text.type(_INT)} {flag}, {zero}")
+        return self.text.let(f"icmp ne {self.text.type(_INT32)} {flag}, {zero}")
 
 
 #: The number of threads comes first, then the leaves.
-MAPPED = handler.Positions(threads=0, items=1, steps=0)
+MAPPING = handler.Positions(threads=0, items=1, steps=0)
 
 
-def mapping_text(written: scalarized.Scalarized, lanes: int) -> str:
+def mapping_text(program: scalarized.Scalarized, lanes: int) -> str:
     """Returns the LLVM IR of ``@work(job)``.
 
     Its arguments are the threads [] int32 and the leaves [N, ...] of the function's arguments that
     are not empty; its results the leaves of its result.
 
     Args:
-      written: the function.
+      program: the function.
       lanes: how many lanes a vector has.
     """
-    return _Map(Text(lanes, _MOST_ON_STACK), written).write()
+    return _Map(Text(lanes, _MAX_STACK), program).write()
 
 
 class _Map(handler.JobText):
     """Writes ``@work``."""
 
-    def __init__(self, text: Text, written: scalarized.Scalarized):
+    def __init__(self, text: Text, program: scalarized.Scalarized):
         super().__init__(text)
-        self.written = written
-        self.inputs = written.in_avals
+        self.written = program
+        self.inputs = program.in_avals
 
     def write(self) -> str:
         """Returns the function."""
         text = self.text
         text.line("%control = call i64 @flush()")
-        total = self.job("total", "i64")
+        num_items = self.job("total", "i64")
         data = self.job("data", "ptr")
         next_item = self.field("next")
         # Leaves without numbers have no buffer; the first one has the number of threads.
         arguments = [x for x in self.inputs if num_entries(x)]
-        results = [x for x in self.written.out_avals if num_entries(x)]
-        buffers = [self.element(data, k) for k in range(1 + len(arguments) + len(results))]
+        avals = [x for x in self.written.out_avals if num_entries(x)]
+        buffers = [self.element(data, k) for k in range(1 + len(arguments) + len(avals))]
         argument_buffers = buffers[1 : 1 + len(arguments)]
         result_buffers = buffers[1 + len(arguments) :]
         columns = [
@@ -391,22 +391,22 @@ class _Map(handler.JobText):
         text.start(head)
         # A thread takes a vector's lanes of examples at once; others may have taken all.
         first_item = text.let(f"atomicrmw add ptr {next_item}, i64 {text.lanes} monotonic")
-        unfinished = text.let(f"icmp ult i64 {first_item}, {total}")
-        text.line(f"br i1 {unfinished}, label %{body}, label %{end}")
+        has_items = text.let(f"icmp ult i64 {first_item}, {num_items}")
+        text.line(f"br i1 {has_items}, label %{body}, label %{end}")
         text.start(body)
-        item, mask = self._items(first_item, total)
+        items, mask = self._items(first_item, num_items)
         # An example's numbers are a row, a lane's are a column: they are turned on the way in.
         for aval, buffer, column in zip(
             arguments, argument_buffers, columns_of_arguments, strict=True
         ):
-            for k, index in enumerate(self._indices(item, num_entries(aval))):
+            for k, index in enumerate(self._indices(items, num_entries(aval))):
                 value = text.gather(buffer, index, aval.dtype)
                 text.store(value, text.at(column, aval.dtype, k), aval.dtype)
         emit = LLVM(text, lambda k: Input(columns[k], np.dtype(self.inputs[k].dtype)))
         outputs = emit.compile(self.written.schedule, self.written.outputs)
-        filled_outputs = [values for values in outputs if values]
-        for aval, buffer, values in zip(results, result_buffers, filled_outputs, strict=True):
-            for value, index in zip(values, self._indices(item, num_entries(aval)), strict=True):
+        full_outputs = [values for values in outputs if values]
+        for aval, buffer, values in zip(avals, result_buffers, full_outputs, strict=True):
+            for value, index in zip(values, self._indices(items, num_entries(aval)), strict=True):
                 text.scatter(value, buffer, index, mask, aval.dtype)
         text.line(f"br label %{head}")
         text.start(end)
@@ -414,23 +414,23 @@ class _Map(handler.JobText):
         text.leave()
         return text.function("void @work(ptr %job)")
 
-    def _items(self, first_item: str, total: str) -> tuple[str, str]:
+    def _items(self, first_item: str, num_items: str) -> tuple[str, str]:
         """Returns the example of each lane, and which lanes have one of their own."""
         text = self.text
-        kind = text.type(_LONG)
+        kind = text.type(_INT64)
         lanes = ", ".join(f"i64 {lane}" for lane in range(text.lanes))
         # A single lane is a scalar in LLVM, not a vector of one.
         offsets = "0" if text.lanes == 1 else f"<{lanes}>"
-        item = text.let(f"add {kind} {text.broadcast('i64', first_item)}, {offsets}")
-        count = text.broadcast("i64", total)
-        mask = text.let(f"icmp ult {kind} {item}, {count}")
-        last = text.let(f"sub {kind} {count}, {text.constant(np.int64(1))}")
+        items = text.let(f"add {kind} {text.broadcast('i64', first_item)}, {offsets}")
+        count = text.broadcast("i64", num_items)
+        mask = text.let(f"icmp ult {kind} {items}, {count}")
+        last_lane = text.let(f"sub {kind} {count}, {text.constant(np.int64(1))}")
         bools = text.type(bool)
-        return text.let(f"select {bools} {mask}, {kind} {item}, {kind} {last}"), mask
+        return text.let(f"select {bools} {mask}, {kind} {items}, {kind} {last_lane}"), mask
 
-    def _indices(self, item: str, size: int) -> list[str]:
+    def _indices(self, items: str, size: int) -> list[str]:
         """Returns where in an array [N, size] each lane's entries are."""
         text = self.text
-        kind = text.type(_LONG)
-        start = text.let(f"mul {kind} {item}, {text.constant(np.int64(size))}")
+        kind = text.type(_INT64)
+        start = text.let(f"mul {kind} {items}, {text.constant(np.int64(size))}")
         return [text.let(f"add {kind} {start}, {text.constant(np.int64(k))}") for k in range(size)]

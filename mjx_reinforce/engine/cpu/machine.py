@@ -31,13 +31,13 @@ LEVELS = {
     "x86-64-v4": (16, ("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl")),
 }
 #: LLVM holds vectors of 512 bits back where they lower the clock; the lanes are worth more.
-_WIDE = "-prefer-256-bit"
+_WIDTH = "-prefer-256-bit"
 #: Characters of a text that LLVM compiles with less effort, and in a process of its own.
 _LONG_TEXT = 2_000_000
-_LOADED: dict[str, "Code"] = {}
+_CACHE: dict[str, "Code"] = {}
 _LOCK = threading.Lock()
 #: Makes the names of libraries different.
-_NUMBERS = itertools.count()
+_LIBRARY_NUMBERS = itertools.count()
 
 
 class Machine(NamedTuple):
@@ -94,9 +94,9 @@ def this_machine(level: str | None = None) -> Machine:
     if level != HOST:
         check_name(VARIABLE, level, LEVELS)
         lanes = _check_level(level, triple, features)
-        return Machine(triple, level, _WIDE if lanes == 16 else "", lanes)
+        return Machine(triple, level, _WIDTH if lanes == 16 else "", lanes)
     if features.get("avx512f"):
-        return Machine(triple, llvm.get_host_cpu_name(), f"{features.flatten()},{_WIDE}", 16)
+        return Machine(triple, llvm.get_host_cpu_name(), f"{features.flatten()},{_WIDTH}", 16)
     # Without AVX that of SSE, or of NEON: 128 bits.
     lanes = 8 if features.get("avx") else 4
     return Machine(triple, llvm.get_host_cpu_name(), features.flatten(), lanes)
@@ -105,14 +105,14 @@ def this_machine(level: str | None = None) -> Machine:
 def _check_level(level: str, triple: str, features: dict[str, bool]) -> int:
     """Returns the lanes of a level; ValueError if this CPU is below it."""
     # A level has the features of all levels before it, too.
-    names = list(LEVELS)
-    needed = [f for name in names[: names.index(level) + 1] for f in LEVELS[name][1]]
-    lacking = [feature for feature in needed if not features.get(feature)]
+    levels = list(LEVELS)
+    required = [f for name in levels[: levels.index(level) + 1] for f in LEVELS[name][1]]
+    absent = [feature for feature in required if not features.get(feature)]
     if not triple.startswith("x86_64"):
-        lacking = [f"this is {triple.partition('-')[0]}"]
-    if lacking:
+        absent = [f"this is {triple.partition('-')[0]}"]
+    if absent:
         raise ValueError(
-            f"{VARIABLE} asks for {level!r}, which this CPU is not: no {', '.join(lacking)}; "
+            f"{VARIABLE} asks for {level!r}, which this CPU is not: no {', '.join(absent)}; "
             "unset it"
         )
     return LEVELS[level][0]
@@ -121,7 +121,7 @@ def _check_level(level: str, triple: str, features: dict[str, bool]) -> int:
 def load_module(
     source: str,
     write: Callable[[], str],
-    names: tuple[str, ...],
+    functions: tuple[str, ...],
     machine: Machine,
     folder: Path | None,
 ) -> Code:
@@ -132,7 +132,7 @@ def load_module(
     Args:
       source: all that the module's text depends on, or a hash of it.
       write: returns the text, LLVM IR without a target. It may call functions of the C library.
-      names: the functions to be found in ``addresses``.
+      functions: the functions to be found in ``addresses``.
       machine: what to compile for.
       folder: where compiled objects are kept; None keeps none.
 
@@ -140,26 +140,26 @@ def load_module(
       RuntimeError: the text is no LLVM IR, or it calls a function that is nowhere; a long text's
         ``addresses`` raise the latter.
     """
-    key = objects.key_of(*machine, *names, source)
+    key = objects.key_of(*machine, *functions, source)
     with _LOCK:
-        if key not in _LOADED:
+        if key not in _CACHE:
             object_code = objects.kept(key, folder)
             if object_code:
-                future = _done(_link(key, names, object_code))
+                future = _done(_link(key, functions, object_code))
             else:
-                future = _make(key, write(), names, machine, folder)
-            _LOADED[key] = Code(key, future, compiled=not object_code)
-        return _LOADED[key]
+                future = _make(key, write(), functions, machine, folder)
+            _CACHE[key] = Code(key, future, compiled=not object_code)
+        return _CACHE[key]
 
 
 def _make(
-    key: str, text: str, names: tuple[str, ...], machine: Machine, folder: Path | None
+    key: str, text: str, functions: tuple[str, ...], machine: Machine, folder: Path | None
 ) -> Future[dict[str, int]]:
     """Returns where the functions of a module will be."""
 
     def finish(compile: Callable[[str, Machine], bytes]) -> dict[str, int]:
         data = objects.make(key, folder, text, lambda text: compile(text, machine))
-        return _link(key, names, data)
+        return _link(key, functions, data)
 
     # A program without Python's own executable, as one that embeds it, has no other process.
     if len(text) <= _LONG_TEXT or not sys.executable:
@@ -176,18 +176,18 @@ def _done(addresses: dict[str, int]) -> Future[dict[str, int]]:
 
 def in_memory() -> list[str]:
     """Returns the keys of all code in memory."""
-    return list(_LOADED)
+    return list(_CACHE)
 
 
-def loaded(key: str, names: tuple[str, ...], folder: Path) -> Code | None:
+def loaded(key: str, functions: tuple[str, ...], folder: Path) -> Code | None:
     """Returns the functions of a module by the key of their ``Code``; None if it is not on disk."""
     with _LOCK:
-        if key not in _LOADED:
+        if key not in _CACHE:
             data = objects.read_object(folder, key)
             if data is None:
                 return None
-            _LOADED[key] = Code(key, _done(_link(key, names, data)), compiled=False)
-        return _LOADED[key]
+            _CACHE[key] = Code(key, _done(_link(key, functions, data)), compiled=False)
+        return _CACHE[key]
 
 
 def _compile(text: str, machine: Machine) -> bytes:
@@ -217,15 +217,15 @@ def _target(machine: Machine, effort: int = 2) -> Any:
     return emit.target_machine(machine.triple, machine.cpu, machine.features, effort)
 
 
-def _link(key: str, names: tuple[str, ...], data: bytes) -> dict[str, int]:
+def _link(key: str, functions: tuple[str, ...], data: bytes) -> dict[str, int]:
     """Puts object code into memory for good; returns where its functions are."""
     import llvmlite.binding as llvm
 
     builder = llvm.JITLibraryBuilder().add_object_img(data).add_current_process()
-    for name in names:
+    for name in functions:
         builder.export_symbol(name)
-    library = builder.link(_linker(), f"{key}.{next(_NUMBERS)}")
-    addresses = {name: library[name] for name in names}
+    library = builder.link(_linker(), f"{key}.{next(_LIBRARY_NUMBERS)}")
+    addresses = {name: library[name] for name in functions}
     # Its code would be unloaded with the Python object, while threads of XLA may still run it.
     library.detach()
     return addresses

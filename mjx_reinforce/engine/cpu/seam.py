@@ -16,23 +16,23 @@ from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.cpu import emit, handler, machine
 from mjx_reinforce.engine.cpu.machine import Code
 
-_WAITING = Path(__file__).with_name("waiting.ll")
+_WAITING_HANDLER = Path(__file__).with_name("waiting.ll")
 #: The keys of the code whose handler XLA has.
-_REGISTERED: set[str] = set()
+_HANDLER_KEYS: set[str] = set()
 
 
 def call(
-    code: Code, results: Sequence[jax.ShapeDtypeStruct], *args: jax.Array
+    code: Code, shapes: Sequence[jax.ShapeDtypeStruct], *args: jax.Array
 ) -> Sequence[jax.Array]:
     """Calls machine code under any transformation but differentiation.
 
     Args:
-      code: a function of ``handler.NAMES``.
-      results: shapes and dtypes of what it returns, as ``handler.handler_text`` says.
+      code: a function of ``handler.SYMBOLS``.
+      shapes: shapes and dtypes of what it returns, as ``handler.handler_text`` says.
       args: arrays, as ``handler.handler_text`` says; vmapped, all get the new axis in front.
     """
     register(code)
-    return jax.ffi.ffi_call(_target(code.key), results, vmap_method="broadcast_all")(*args)
+    return jax.ffi.ffi_call(_target(code.key), shapes, vmap_method="broadcast_all")(*args)
 
 
 def register(code: Code) -> None:
@@ -41,16 +41,16 @@ def register(code: Code) -> None:
     Raises:
       RuntimeError: XLA does not take it.
     """
-    if code.key in _REGISTERED:
+    if code.key in _HANDLER_KEYS:
         return
     jax.devices()  # a handler refused before XLA has started would keep it from starting
     # XLA keeps the first address that it gets; of code that is still compiled that of a handler
     # which waits for it.
-    compiled = code.future_addresses.done()
-    address = code.addresses["handler"] if compiled else _waiting_handler(code)
+    is_compiled = code.future_addresses.done()
+    address = code.addresses["handler"] if is_compiled else _waiting_handler(code)
     capsule = jax.ffi.pycapsule(ctypes.c_void_p(address))
     jax.ffi.register_ffi_target(_target(code.key), capsule, platform="cpu")
-    _REGISTERED.add(code.key)
+    _HANDLER_KEYS.add(code.key)
 
 
 def targets() -> list[str]:
@@ -66,7 +66,7 @@ def restore(program: bytes) -> bool:
     """
     folder = objects.folder()
     for name in set(re.findall(rb"mjx_reinforce_([0-9a-f]{64})", program)):
-        code = machine.loaded(name.decode(), handler.NAMES, folder) if folder else None
+        code = machine.loaded(name.decode(), handler.SYMBOLS, folder) if folder else None
         if code is None:
             return False
         register(code)
@@ -83,11 +83,11 @@ def _waiting_handler(code: Code) -> int:
 
     XLA compiles the program around it meanwhile.
     """
-    text = f"; waits for {code.key}\n{handler.with_entry(_WAITING, {})}"
-    names = ("handler", "slot", "failed")
+    text = f"; waits for {code.key}\n{handler.with_entry(_WAITING_HANDLER, {})}"
+    functions = ("handler", "slot", "failed")
     target = machine.this_machine()
     # A short text is compiled at once, so these addresses need no waiting.
-    addresses = machine.load_module(text, lambda: text, names, target, None).addresses
+    addresses = machine.load_module(text, lambda: text, functions, target, None).addresses
 
     def fill_slot(future: Future[dict[str, int]]) -> None:
         address = addresses["failed"] if future.exception() else future.result()["handler"]

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 #: Where pip puts it, in the folder nvidia: for CUDA 13, and for CUDA 12.
-_NAMES = ("cu*/lib/libnvrtc.so.??", "cuda_nvrtc/lib/libnvrtc.so.??")
+_GLOBS = ("cu*/lib/libnvrtc.so.??", "cuda_nvrtc/lib/libnvrtc.so.??")
 #: Division and roots as XLA's GPU programs have them, and denormals are zero.
 _OPTIONS = ("--std=c++17", "-default-device", "-ftz=true", "-prec-div=false", "-prec-sqrt=false")
 
@@ -17,7 +17,7 @@ def library() -> ctypes.CDLL | None:
     """Returns NVRTC: that of pip, or CUDA's; None if there is none."""
     nvidia = importlib.util.find_spec("nvidia")
     folders = map(Path, (nvidia and nvidia.submodule_search_locations) or [])
-    paths = [path for folder in folders for name in _NAMES for path in sorted(folder.glob(name))]
+    paths = [path for folder in folders for name in _GLOBS for path in sorted(folder.glob(name))]
     paths.append(Path(os.environ.get("CUDA_HOME", "/usr/local/cuda"), "lib64/libnvrtc.so"))
     for path in paths:
         # A library may be there and still not load, as one of another machine's architecture.

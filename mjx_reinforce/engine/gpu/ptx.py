@@ -24,14 +24,14 @@ from mjx_reinforce.engine import objects, scalar
 from mjx_reinforce.engine.cpu import handler, machine
 from mjx_reinforce.engine.gpu import nvrtc
 from mjx_reinforce.engine.gpu.kernel import ENTRY
-from mjx_reinforce.engine.gpu.source import Facts, Language, Source
+from mjx_reinforce.engine.gpu.source import Language, Launch, Source
 
 #: LLVM's name of NVIDIA's GPUs.
 TRIPLE = "nvptx64-nvidia-cuda"
 _VERSION = r"\.version (\d+\.\d+)"
 #: What GPUs of compute capability 7.0 need. For one that it does not know, LLVM writes 3.2.
 _LEAST_VERSION = 6.0
-_LOADED: dict[str, "Kernel"] = {}
+_CACHE: dict[str, "Kernel"] = {}
 _LOCK = threading.Lock()
 
 
@@ -41,20 +41,20 @@ class Kernel(NamedTuple):
     key: a name for all that it depends on
     language: "ptx" or "cuda"
     text: its entry is "play"
-    facts: how it is launched
+    launch: how it is launched
     compiled: whether it was compiled now, and not read from disk
     """
 
     key: str
     language: Language
     text: str
-    facts: Facts
+    launch: Launch
     compiled: bool
 
     @property
     def source(self) -> Source:
         """What its machine code is made of."""
-        return Source(self.language, self.text, self.facts)
+        return Source(self.language, self.text, self.launch)
 
 
 def load_kernel(
@@ -74,11 +74,11 @@ def load_kernel(
     """
     key = objects.key_of(capability, source)
     with _LOCK:
-        if key not in _LOADED:
+        if key not in _CACHE:
             cached = objects.kept(key, folder)
             content = cached or _make(key, folder, write(), capability)
-            _LOADED[key] = described(key, content, compiled=not cached)
-        return _LOADED[key]
+            _CACHE[key] = described(key, content, compiled=not cached)
+        return _CACHE[key]
 
 
 def _make(key: str, folder: Path | None, source: Source, capability: str) -> bytes:
@@ -91,16 +91,16 @@ def _make(key: str, folder: Path | None, source: Source, capability: str) -> byt
             language = "ptx"
             text = _compile(text, capability)
         else:
-            text = source.text  # without the macros of its facts, which stand in the first line
-        head = {"language": language, **source.facts._asdict()}
-        return f"{json.dumps(head)}\n{text}".encode()
+            text = source.text  # without the macros of its launch, which stand in the first line
+        metadata = {"language": language, **source.launch._asdict()}
+        return f"{json.dumps(metadata)}\n{text}".encode()
 
     return objects.make(key, folder, source.for_compiler(), compile)
 
 
 def in_memory() -> list[str]:
     """Returns the keys of all kernels in memory."""
-    return list(_LOADED)
+    return list(_CACHE)
 
 
 def kept(key: str, folder: Path) -> Kernel | None:
@@ -112,9 +112,9 @@ def kept(key: str, folder: Path) -> Kernel | None:
 def described(key: str, content: bytes, *, compiled: bool) -> Kernel:
     """Returns a kernel from what is kept of it, whose first line says what it is."""
     line, _, text = content.decode().partition("\n")
-    head = json.loads(line)
-    language = head.pop("language")
-    return Kernel(key, language, text, Facts(**head), compiled)
+    metadata = json.loads(line)
+    language = metadata.pop("language")
+    return Kernel(key, language, text, Launch(**metadata), compiled)
 
 
 def _compile(text: str, capability: str) -> str:
@@ -131,31 +131,31 @@ def _compile(text: str, capability: str) -> str:
         cpu=f"sm_{capability.replace('.', '')}", opt=3
     )
     header = f'target datalayout = "{target.target_data}"\ntarget triple = "{TRIPLE}"\n'
-    written = target.emit_assembly(llvm.parse_assembly(header + text))
-    version = re.findall(_VERSION, written)[0]
+    assembly = target.emit_assembly(llvm.parse_assembly(header + text))
+    version = re.findall(_VERSION, assembly)[0]
     if float(version) < _LEAST_VERSION:
         raise RuntimeError(
             f"llvmlite {llvmlite.__version__} does not know GPUs of compute capability "
             f"{capability}; install a newer one"
         )
-    return _with_xla_divisions(written)
+    return _with_xla_divisions(assembly)
 
 
 def _with_xla_divisions(text: str) -> str:
     """Returns PTX with division as XLA's GPU programs have it, within 2 units in the last place."""
-    replaced = text.replace("div.rn.ftz.f32", "div.full.ftz.f32")
+    xla_text = text.replace("div.rn.ftz.f32", "div.full.ftz.f32")
     # One that is rounded correctly is a subroutine of many instructions: it would go unnoticed, and
     # slow every kernel, if a later LLVM spelled divisions otherwise.
-    exact_division = re.search(r"\bdiv\.rn\S*\.f32", replaced)
+    exact_division = re.search(r"\bdiv\.rn\S*\.f32", xla_text)
     assert exact_division is None, f"LLVM has another name for a division: {exact_division}"
-    return replaced
+    return xla_text
 
 
-_TEXT = Path(__file__).with_name("launcher.ll")
+_LAUNCHER = Path(__file__).with_name("launcher.ll")
 #: CUDA's number of the attribute of a kernel: bytes of shared memory that a launch may ask for.
-_MOST_SHARED = 8
+_SHARED_ATTRIBUTE = 8
 #: What slots point to; a launch may read it until the process ends.
-_FILLED: list[ctypes.Array[ctypes.c_void_p]] = []
+_SLOT_VALUES: list[ctypes.Array[ctypes.c_void_p]] = []
 
 
 class Assembler(NamedTuple):
@@ -175,9 +175,9 @@ def launcher(key: str) -> tuple[int, int]:
     The slot is a pointer to ``cuLaunchKernel`` and the kernel; a launch waits while it is null.
     """
     # The key is in the text so that each kernel has a module, and with it a slot, of its own.
-    text = f"; launches {key}\n{handler.with_entry(_TEXT, {})}"
-    names = ("handler", "slot")
-    code = machine.load_module(text, lambda: text, names, machine.this_machine(), None)
+    text = f"; launches {key}\n{handler.with_entry(_LAUNCHER, {})}"
+    functions = ("handler", "slot")
+    code = machine.load_module(text, lambda: text, functions, machine.this_machine(), None)
     return code.addresses["handler"], code.addresses["slot"]
 
 
@@ -191,18 +191,18 @@ def fill(slot: int, kernel: Kernel, assemblers: Sequence[Assembler], folder: Pat
       folder: where machine code is kept; None keeps none.
     """
     cuda = ctypes.CDLL("libcuda.so.1")
-    ready = ctypes.c_void_p()
+    handle = ctypes.c_void_p()
     for assembler in assemblers:
         try:
             image = _machine_code(kernel, assembler, folder)
-            ready = _in_memory(cuda, image, kernel.facts.shared)
+            handle = _in_memory(cuda, image, kernel.launch.shared)
             break
         except Exception as error:  # whatever an assembler or a driver raises
             objects.describe(kernel.key, f"not by {assembler.name}: {error}")
     launch = ctypes.cast(cuda.cuLaunchKernel, ctypes.c_void_p)
-    _FILLED.append((ctypes.c_void_p * 3)(launch, ready, kernel.facts.shared))
+    _SLOT_VALUES.append((ctypes.c_void_p * 3)(launch, handle, kernel.launch.shared))
     # Last of all, as a launch in another thread reads all three once the slot is not null.
-    ctypes.c_void_p.from_address(slot).value = ctypes.addressof(_FILLED[-1])
+    ctypes.c_void_p.from_address(slot).value = ctypes.addressof(_SLOT_VALUES[-1])
 
 
 def _machine_code(kernel: Kernel, assembler: Assembler, folder: Path | None) -> bytes:
@@ -219,13 +219,13 @@ def _machine_code(kernel: Kernel, assembler: Assembler, folder: Path | None) -> 
     return machine_code
 
 
-def _in_memory(cuda: ctypes.CDLL, image: bytes, shared: int) -> ctypes.c_void_p:
+def _in_memory(cuda: ctypes.CDLL, image: bytes, num_bytes: int) -> ctypes.c_void_p:
     """Returns the driver's handle of a kernel, for all GPUs that its machine code is for.
 
     Args:
       cuda: the driver.
       image: machine code, or PTX.
-      shared: bytes of shared memory that a block is launched with.
+      num_bytes: bytes of shared memory that a block is launched with.
     """
     library = ctypes.c_void_p()
     kernel = ctypes.c_void_p()
@@ -236,11 +236,11 @@ def _in_memory(cuda: ctypes.CDLL, image: bytes, shared: int) -> ctypes.c_void_p:
     if status := cuda.cuLibraryGetKernel(ctypes.byref(kernel), library, ENTRY.encode()):
         raise RuntimeError(f"cuLibraryGetKernel returned {status}")
     # Without the attribute, a launch that asks for more than 48 KiB of shared memory is an error.
-    if shared:
+    if num_bytes:
         count = ctypes.c_int()
         cuda.cuDeviceGetCount(ctypes.byref(count))
         for device in range(count.value):
-            if status := cuda.cuKernelSetAttribute(_MOST_SHARED, shared, kernel, device):
+            if status := cuda.cuKernelSetAttribute(_SHARED_ATTRIBUTE, num_bytes, kernel, device):
                 raise RuntimeError(f"cuKernelSetAttribute returned {status}")
     return kernel
 
@@ -276,10 +276,10 @@ def _programs() -> list[str]:
     """Returns where ptxas is: that of pip, which JAX brings, on PATH, in CUDA's folder."""
     nvidia = importlib.util.find_spec("nvidia")
     folders = map(Path, (nvidia and nvidia.submodule_search_locations) or [])
-    of_pip = [str(path) for folder in folders for path in sorted(folder.glob("cu*/bin/ptxas"))]
+    pip_paths = [str(path) for folder in folders for path in sorted(folder.glob("cu*/bin/ptxas"))]
     cuda = f"{os.environ.get('CUDA_HOME', '')}/bin"
-    of_system = shutil.which("ptxas"), shutil.which("ptxas", path=cuda)
-    return of_pip + [path for path in of_system if path]
+    system_paths = shutil.which("ptxas"), shutil.which("ptxas", path=cuda)
+    return pip_paths + [path for path in system_paths if path]
 
 
 def _by_program(path: str, capability: str, text: str) -> tuple[str, bytes]:

@@ -21,7 +21,7 @@ from mjx_reinforce.engine.gpu import team_kernel as team
 from mjx_reinforce.engine.gpu.source import WARP
 
 #: LLVM 22, which llvmlite 0.48 has, is the first that bounds a kernel's threads and blocks.
-_OLDEST = (22,)
+_MIN_LLVM = (22,)
 #: What may assemble a kernel, what is preferred first.
 Assemblers = tuple[ptx.Assembler, ...]
 #: XLA's names of the handlers that it knows.
@@ -38,7 +38,7 @@ def kernels_unavailable() -> str | None:
         return f"it runs on NVIDIA GPUs of compute capability 7.0 or more, this is {capability!r}"
     if jax.config.values["jax_enable_x64"]:
         return "on GPUs it plays in float32 alone, and jax_enable_x64 is set"
-    if llvm.llvm_version_info < _OLDEST:
+    if llvm.llvm_version_info < _MIN_LLVM:
         return "its kernels need llvmlite 0.48 or newer; pip install 'llvmlite>=0.48'"
     llvm.initialize_all_targets()
     try:
@@ -135,7 +135,7 @@ def launch(
     Returns:
       What the kernel does, without the seeds' axis.
     """
-    play = in_one_launch(lambda *stacked: _launch(kernel, record, horizon, *stacked))
+    play = in_one_launch(lambda *batch: _launch(kernel, record, horizon, *batch))
     return [x[0] for x in play(*(x[None] for x in args))]
 
 
@@ -145,20 +145,20 @@ def in_one_launch(run: Callable[..., Sequence[jax.Array]]) -> Callable[..., Sequ
     Args:
       run: arrays [B, ...] -> a list of arrays [B, ...]; vmapped, it is given all examples along B.
     """
-    together = jax.custom_batching.custom_vmap(run)
+    batched_run = jax.custom_batching.custom_vmap(run)
 
-    @together.def_vmap
-    def _(size, mapped, *args):
+    @batched_run.def_vmap
+    def _(size, axes, *args):
         """Joins the mapped axis [size] with the batch axis [B] behind it: one call for all."""
-        stacked = [
+        batch = [
             x if is_mapped else jnp.broadcast_to(x, (size, *x.shape))
-            for x, is_mapped in zip(args, mapped, strict=True)
+            for x, is_mapped in zip(args, axes, strict=True)
         ]
-        results = together(*(x.reshape(-1, *x.shape[2:]) for x in stacked))
-        # ``together`` again, not ``run``: an outer vmap finds the same rule.
-        return [x.reshape(size, -1, *x.shape[1:]) for x in results], [True] * len(results)
+        outputs = batched_run(*(x.reshape(-1, *x.shape[2:]) for x in batch))
+        # ``batched_run`` again, not ``run``: an outer vmap finds the same rule.
+        return [x.reshape(size, -1, *x.shape[1:]) for x in outputs], [True] * len(outputs)
 
-    return together
+    return batched_run
 
 
 def _launch(
@@ -176,22 +176,22 @@ def _launch(
 
 
 def launch_map(
-    kernel: ptx.Kernel, results: Sequence[jax.ShapeDtypeStruct], *args: jax.Array
+    kernel: ptx.Kernel, shapes: Sequence[jax.ShapeDtypeStruct], *args: jax.Array
 ) -> Sequence[jax.Array]:
     """Runs a kernel that maps a function; vmapped, it remains one launch.
 
     Args:
       kernel: of ``kernel.mapping_text``.
-      results: shape [N, ...] and dtype of what it returns.
+      shapes: shape [N, ...] and dtype of what it returns.
       args: its arguments [N, ...].
     """
 
     def play(*args):
         examples = len(args[0])
-        sized, grid = _sized(kernel, examples)
+        sized_kernel, grid = _sized(kernel, examples)
         sizes = jnp.array([examples, math.prod(grid)], jnp.int32)
-        stacked = [jax.ShapeDtypeStruct((examples, *x.shape[1:]), x.dtype) for x in results]
-        return _call(sized, grid, [sizes, *args], [], stacked)
+        batch_shapes = [jax.ShapeDtypeStruct((examples, *x.shape[1:]), x.dtype) for x in shapes]
+        return _call(sized_kernel, grid, [sizes, *args], [], batch_shapes)
 
     return in_one_launch(play)(*args)
 
@@ -201,7 +201,7 @@ def _call(
     grid: tuple[int, int],
     arguments: Sequence[jax.Array],
     initial: Sequence[jax.Array],
-    results: Sequence[jax.ShapeDtypeStruct | jax.Array],
+    shapes: Sequence[jax.ShapeDtypeStruct | jax.Array],
 ) -> Sequence[jax.Array]:
     """Launches blocks of threads; returns what they make of the initial values of the results.
 
@@ -213,33 +213,33 @@ def _call(
       grid: how many blocks of how many threads.
       arguments: what the kernel reads.
       initial: values of the results, or none.
-      results: their shapes and dtypes.
+      shapes: their shapes and dtypes.
     """
     scratch = []
-    if words := kernel.facts.scratch * math.prod(grid):
+    if words := kernel.launch.scratch * math.prod(grid):
         scratch.append(jax.ShapeDtypeStruct((words,), jnp.int32))
     # XLA lets the kernel write over the initial values, rather than copy them.
     aliases = {len(arguments) + k: k for k in range(len(initial))}
     blocks, threads = map(np.int32, grid)
     target = _handler(kernel)
-    call = jax.ffi.ffi_call(target, [*results, *scratch], input_output_aliases=aliases)
-    return call(*arguments, *initial, blocks=blocks, threads=threads)[: len(results)]
+    call = jax.ffi.ffi_call(target, [*shapes, *scratch], input_output_aliases=aliases)
+    return call(*arguments, *initial, blocks=blocks, threads=threads)[: len(shapes)]
 
 
-def _sized(kernel: ptx.Kernel, items: int) -> tuple[ptx.Kernel, tuple[int, int]]:
+def _sized(kernel: ptx.Kernel, count: int) -> tuple[ptx.Kernel, tuple[int, int]]:
     """Returns the kernel, and how many blocks of how many threads, that play so many items."""
-    if kernel.facts.lanes > 1:
-        kernel = team.for_items(kernel, items, jax.devices()[0].core_count, compute_capability())
-    facts = kernel.facts
-    return kernel, _grid(items * facts.lanes, facts.threads, facts.blocks)
+    if kernel.launch.lanes > 1:
+        kernel = team.for_items(kernel, count, jax.devices()[0].core_count, compute_capability())
+    launch = kernel.launch
+    return kernel, _grid(count * launch.lanes, launch.threads, launch.blocks)
 
 
-def _grid(items: int, most: int, blocks: int) -> tuple[int, int]:
+def _grid(num_items: int, limit: int, blocks: int) -> tuple[int, int]:
     """Returns how many blocks of how many threads, at most so many, play so many episodes.
 
     They are spread over all multiprocessors, each of which has so many blocks at most.
     """
     processors = jax.devices()[0].core_count
     # A block is whole warps. Few episodes get small blocks, so that each multiprocessor has some.
-    threads = min(WARP * -(-items // (WARP * processors)), most)
-    return min(-(-items // threads), blocks * processors), threads
+    threads = min(WARP * -(-num_items // (WARP * processors)), limit)
+    return min(-(-num_items // threads), blocks * processors), threads

@@ -8,8 +8,11 @@ Language = Literal["llvm", "ptx", "cuda"]
 WARP = 32
 
 
-class Facts(NamedTuple):
+class Launch(NamedTuple):
     """How a kernel is launched.
+
+    The fields' names are keys of the first line of a kept kernel (``ptx.described``); macros of
+    CUDA C++ have their values, but for ``blocks`` (``Source.for_compiler``).
 
     threads: of a block, at most
     blocks: on a multiprocessor; its registers are as many as that leaves each thread
@@ -30,19 +33,19 @@ class Source(NamedTuple):
 
     language: Language
     text: str
-    facts: Facts
+    launch: Launch
 
     def for_compiler(self) -> str:
-        """Returns the text as its compiler reads it: CUDA C++ reads the facts as macros."""
+        """Returns the text as its compiler reads it: CUDA C++ reads the launch as macros."""
         if self.language != "cuda":
             return self.text
-        facts = self.facts
+        launch = self.launch
         return (
-            f"// teams of {facts.lanes}, {facts.threads} threads, {facts.shared} bytes, "
-            f"scratch = {facts.scratch}\n"
-            f"#define WARPS {facts.threads // WARP}\n"
-            f"#define W {facts.lanes}\n"
-            f"#define SHARED {facts.shared}\n"
-            f"#define THREAD_WORDS {facts.scratch}\n"
+            f"// teams of {launch.lanes}, {launch.threads} threads, {launch.shared} bytes, "
+            f"scratch = {launch.scratch}\n"
+            f"#define WARPS {launch.threads // WARP}\n"
+            f"#define W {launch.lanes}\n"
+            f"#define SHARED {launch.shared}\n"
+            f"#define THREAD_WORDS {launch.scratch}\n"
             f"{self.text}"
         )

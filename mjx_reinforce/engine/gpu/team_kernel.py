@@ -13,7 +13,7 @@ import numpy as np
 from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.gpu.kernel import CONTROLS, RESULTS
-from mjx_reinforce.engine.gpu.source import WARP, Facts, Source
+from mjx_reinforce.engine.gpu.source import WARP, Launch, Source
 from mjx_reinforce.engine.scalar import scalarized
 from mjx_reinforce.engine.scalar.jaxprs import num_entries
 from mjx_reinforce.engine.team.operations import type_of
@@ -52,7 +52,7 @@ class Physics(NamedTuple):
     shared: int
 
 
-_PLAY = """
+_PLAY_LOOP = """
 extern "C" KERNEL play({parameters}) {{
   OWN_PLACE
   const int seeds = sizes[0], episodes = sizes[1], horizon = sizes[2], items = seeds * episodes;
@@ -94,7 +94,7 @@ extern "C" KERNEL play({parameters}) {{
   }}
 }}
 """
-_MAP = """
+_MAP_LOOP = """
 extern "C" KERNEL play({parameters}) {{
   OWN_PLACE
   for (int item = t.first(); t.meet(item < sizes[0]); item += t.stride()) {{
@@ -107,27 +107,27 @@ extern "C" KERNEL play({parameters}) {{
 """
 
 
-def player_text(written: scalarized.Scalarized, physics: Physics, num_actor: int) -> Source:
+def player_text(program: scalarized.Scalarized, physics: Physics, num_actor: int) -> Source:
     """Returns the C++ of a kernel with the arguments of ``gpu.kernel.kernel_text``.
 
     Args:
-      written: of ``program.step_function`` where an episode is running, the physics kept whole.
+      program: of ``program.step_function`` where an episode is running, the physics kept whole.
       physics: that of the environment.
       num_actor: how many leaves of its arguments are the actor's.
     """
-    leaves = _leaves(written.in_avals)
+    leaves = _leaves(program.in_avals)
     keys = len(leaves) - _NUM_OTHERS
-    at = keys + 1
+    step_input = keys + 1
     mode = keys + 2
-    carried = range(num_actor, at)  # the state, and the keys behind it
-    words = [-(-leaves[k].size * leaves[k].itemsize // 4) for k in carried]
-    offsets = dict(zip(carried, np.cumsum([0, *words]).tolist(), strict=False))
+    carry_inputs = range(num_actor, step_input)  # the state, and the keys behind it
+    words = [-(-leaves[k].size * leaves[k].itemsize // 4) for k in carry_inputs]
+    offsets = dict(zip(carry_inputs, np.cumsum([0, *words]).tolist(), strict=False))
 
-    names = {at: "in_at", mode: "in_mode"}
-    text = CText(written, lambda number: names.get(number, f"in{number}"), physics.skip)
-    observation, action, (reward,), (goes_on,), (broken,), *new_values = written.outputs
-    text.line(f"const bool alive = {text.get(goes_on)} != 0;")
-    text.line(f"const int is_broken = {text.get(broken)};")
+    input_names = {step_input: "in_at", mode: "in_mode"}
+    text = CText(program, lambda number: input_names.get(number, f"in{number}"), physics.skip)
+    observation, action, (reward,), (is_alive,), (is_broken,), *new_values = program.outputs
+    text.line(f"const bool alive = {text.get(is_alive)} != 0;")
+    text.line(f"const int is_broken = {text.get(is_broken)};")
     record = [f"if (t.lane == 0) reward[row * episodes + column] = {text.get(reward)};"]
     record += [
         f"EACH(i, {len(x)}) {field}[(row * {len(x)} + i) * episodes + column] = {text.array(x)}[i];"
@@ -135,22 +135,22 @@ def player_text(written: scalarized.Scalarized, physics: Physics, num_actor: int
     ]
     # Only what the step reads is carried on. To compute a leaf may read others, which then are
     # carried on, too: until no unwritten leaf is read.
-    unwritten = dict(zip(carried, new_values, strict=True))
-    while ready := sorted(unwritten.keys() & text.read):
-        for number in ready:
-            text.fill(f"out{number}", unwritten.pop(number))
+    next_carries = dict(zip(carry_inputs, new_values, strict=True))
+    while ready_inputs := sorted(next_carries.keys() & text.read):
+        for number in ready_inputs:
+            text.fill(f"out{number}", next_carries.pop(number))
     pointers, initial = _carried_text(text, leaves, offsets, num_actor, keys)
     inputs = [*zip(("int", "int", "unsigned"), CONTROLS, strict=True)]
     inputs += [(leaves[k].type, f"actor{k}") for k in range(num_actor) if leaves[k].size]
     inputs += [
         (leaves[k].type, f"state{k - num_actor}") for k in range(num_actor, keys) if leaves[k].size
     ]
-    record_types = [leaf.type for leaf in _leaves(written.out_avals[:3])]
-    results = [*zip([*record_types, *["int"] * 4], RESULTS, strict=True)]
+    record_types = [leaf.type for leaf in _leaves(program.out_avals[:3])]
+    result_fields = [*zip([*record_types, *["int"] * 4], RESULTS, strict=True)]
     # XLA passes the zeros that the results are written over as arguments, too.
-    inputs += [(type_name, f"zero_{name}") for type_name, name in results]
-    loop = _PLAY.format(
-        parameters=_parameters(inputs, results),
+    inputs += [(type_name, f"zero_{name}") for type_name, name in result_fields]
+    loop = _PLAY_LOOP.format(
+        parameters=_parameters(inputs, result_fields),
         own=sum(words),
         begin="\n".join(initial),
         step="\n".join([*pointers, *text.lines]),
@@ -186,42 +186,42 @@ def _carried_text(
         place = f"reinterpret_cast<{leaf.type}*>({{}} + {offsets[number]})"
         pointers.append(f"const {leaf.type}* in{number} = {place.format('own')};")
         pointers.append(f"{leaf.type}* out{number} = {place.format('following')};")
-        array = f"state{number - num_actor}"
+        state_name = f"state{number - num_actor}"
         size = leaf.size
         if number == keys:
             # An episode begins with one key, of two words. The key of its noise, behind it in the
             # step's argument, is made by the first step.
-            array = "keys"
+            state_name = "keys"
             size = 2
-        source = f"{array}[size_t(k) * {size} + i]"
+        source = f"{state_name}[size_t(k) * {size} + i]"
         initial.append(f"EACH(i, {size}) {place.format('own')}[i] = {source};")
     return pointers, initial
 
 
-def mapping_text(written: scalarized.Scalarized, physics: Physics) -> Source:
+def mapping_text(program: scalarized.Scalarized, physics: Physics) -> Source:
     """Returns the C++ of a kernel with the arguments of ``gpu.kernel.mapping_text``.
 
     Args:
-      written: the function, the physics kept whole.
+      program: the function, the physics kept whole.
       physics: that of the environment.
     """
-    text = CText(written, lambda number: f"in{number}", physics.skip)
+    text = CText(program, lambda number: f"in{number}", physics.skip)
     pointers = []
     inputs = [("int", "sizes")]
-    results = []
-    for number, leaf in enumerate(_leaves(written.in_avals)):
+    outputs = []
+    for number, leaf in enumerate(_leaves(program.in_avals)):
         if leaf.size:
             row = f"argument{number} + size_t(k) * {leaf.size}"
             pointers.append(f"const {leaf.type}* in{number} = {row};")
             inputs.append((leaf.type, f"argument{number}"))
-    for number, leaf in enumerate(_leaves(written.out_avals)):
+    for number, leaf in enumerate(_leaves(program.out_avals)):
         if leaf.size:
             row = f"result{number} + size_t(k) * {leaf.size}"
             pointers.append(f"{leaf.type}* out{number} = {row};")
-            results.append((leaf.type, f"result{number}"))
-            text.fill(f"out{number}", written.outputs[number])
-    loop = _MAP.format(
-        parameters=_parameters(inputs, results),
+            outputs.append((leaf.type, f"result{number}"))
+            text.fill(f"out{number}", program.outputs[number])
+    loop = _MAP_LOOP.format(
+        parameters=_parameters(inputs, outputs),
         step="\n".join(pointers + text.lines),
         meets=text.meets,
     )
@@ -232,41 +232,41 @@ def _leaves(avals: Iterable[jax.ShapeDtypeStruct]) -> list[_Leaf]:
     return [_Leaf(type_of(x.dtype), num_entries(x), np.dtype(x.dtype).itemsize) for x in avals]
 
 
-def _parameters(inputs: Iterable[tuple[str, str]], results: Sequence[tuple[str, str]]) -> str:
+def _parameters(inputs: Iterable[tuple[str, str]], outputs: Sequence[tuple[str, str]]) -> str:
     """Returns the parameters of a kernel by their types and names: what it reads and writes."""
     parameters = [f"const {type_name}* __restrict__ {name}" for type_name, name in inputs]
-    parameters += [f"{type_name}* {name}" for type_name, name in results]
+    parameters += [f"{type_name}* {name}" for type_name, name in outputs]
     return ", ".join([*parameters, "Word* scratch"])
 
 
 def _kernel(physics: Physics, text: CText, loop: str, words: int) -> Source:
     """Returns a kernel whose teams have so many words of scratch each, besides far contacts."""
     # At least one, as a team's scratch is found by this number and XLA has no empty buffer.
-    a_thread = max(1, -(-(physics.far + words) // physics.lanes))
-    facts = Facts(
+    thread_words = max(1, -(-(physics.far + words) // physics.lanes))
+    launch = Launch(
         threads=WARP * FEW_WARPS,
         blocks=1,
-        scratch=a_thread,
+        scratch=thread_words,
         lanes=physics.lanes,
         shared=physics.shared,
     )
-    head = f"#define REPORTS ({' | '.join(text.reports) or 0})\n#define FAR_WORDS {physics.far}\n"
-    return Source("cuda", f"{head}{physics.text}\n{loop}", facts)
+    macros = f"#define REPORTS ({' | '.join(text.reports) or 0})\n#define FAR_WORDS {physics.far}\n"
+    return Source("cuda", f"{macros}{physics.text}\n{loop}", launch)
 
 
-def for_items(kernel: ptx.Kernel, items: int, processors: int, capability: str) -> ptx.Kernel:
+def for_items(kernel: ptx.Kernel, num_items: int, processors: int, capability: str) -> ptx.Kernel:
     """Returns a kernel whose blocks are of the size that so many items are played fastest with.
 
     Args:
       kernel: with the blocks for few items.
-      items: how many it plays.
+      num_items: how many it plays.
       processors: the GPU's multiprocessors.
       capability: the GPU's compute capability.
     """
     # Where a team of the small blocks has one episode at most, more teams would have none.
-    facts = kernel.facts
-    if items * facts.lanes <= facts.threads * processors:
+    launch = kernel.launch
+    if num_items * launch.lanes <= launch.threads * processors:
         return kernel
-    source = kernel.source._replace(facts=facts._replace(threads=WARP * _MANY_WARPS))
+    source = kernel.source._replace(launch=launch._replace(threads=WARP * _MANY_WARPS))
     name = f"{kernel.key} {_MANY_WARPS} warps"
     return ptx.load_kernel(name, lambda: source, capability, objects.folder())

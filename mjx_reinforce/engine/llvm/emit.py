@@ -43,9 +43,9 @@ class LLVM(Backend[Value]):
 
     OPERATIONS = OPERATIONS
     #: So many carries, or more, change in place where they can.
-    MANY = 32
+    MANY_CARRIES = 32
     #: What the branch back to the start of a loop tells LLVM.
-    BACK = ""
+    LOOP_HINT = ""
 
     def __init__(self, text: Text, inputs: Callable[[int], Input]):
         """Says what is written into, and where the inputs are.
@@ -92,8 +92,8 @@ class LLVM(Backend[Value]):
     def node(self, node: Node, operands: list[Value]) -> Value:
         """Writes one operation."""
         op = cast(Op, node.op)  # leaves are not scheduled
-        named = zip(node.args, cast(list[str], operands), strict=True)
-        lanes = [Lanes(self._text, np.dtype(arg.dtype), name) for arg, name in named]
+        typed_operands = zip(node.args, cast(list[str], operands), strict=True)
+        lanes = [Lanes(self._text, np.dtype(arg.dtype), name) for arg, name in typed_operands]
         name = OPERATIONS[op.name](op, node.dtype, *lanes).name
         if node in self._stored:
             self._text.store(name, self._stored[node].pointer, node.dtype)
@@ -103,11 +103,11 @@ class LLVM(Backend[Value]):
         self, body: Schedule, values: dict[Node, Value], leaves: Mapping[Node, Value] | None = None
     ) -> dict[Node, Value]:
         """Runs a body; it may run again, and must find what is outside as it was."""
-        before = self._free_places
+        free_places = self._free_places
         self._free_places = set()
-        inner = super().inside(body, values, leaves)
-        self._free_places = before
-        return inner
+        scope = super().inside(body, values, leaves)
+        self._free_places = free_places
+        return scope
 
     def some(self, mask: str) -> str:
         """Returns an i1: whether some lane of a mask is set, for a gate or a loop."""
@@ -116,29 +116,29 @@ class LLVM(Backend[Value]):
     def gate(self, gate: LiveGate, values: dict[Node, Value]) -> Sequence[Value]:
         """Writes a branch that is taken if some lane needs it."""
         text = self._text
-        needed = self.some(self.value(gate.predicate, values))
+        is_needed = self.some(self.value(gate.predicate, values))
         # What the branch stores in place needs no phi: the old value stays if it is skipped.
-        outs = [out for out in gate.outs if out.hot not in self._stored]
+        live_outs = [out for out in gate.outs if out.hot not in self._stored]
         # The phi takes them from the block before the branch, so they must be known there.
-        cold = [self.value(out.cold, values) for out in outs]
-        before = text.block
+        cold_values = [self.value(out.cold, values) for out in live_outs]
+        entry_block = text.block
         hot_block = text.label()
-        after = text.label()
-        text.line(f"br i1 {needed}, label %{hot_block}, label %{after}")
+        tail = text.label()
+        text.line(f"br i1 {is_needed}, label %{hot_block}, label %{tail}")
         text.start(hot_block)
-        inner = self.inside(gate.body, values)
-        hot = [self.value(out.hot, inner) for out in outs]
+        scope = self.inside(gate.body, values)
+        hot_values = [self.value(out.hot, scope) for out in live_outs]
         # Gates and loops in the branch start blocks of their own, so it may end in another block.
         hot_end = text.block
-        text.line(f"br label %{after}")
-        text.start(after)
-        chosen: dict[Node, Value] = {
+        text.line(f"br label %{tail}")
+        text.start(tail)
+        gate_values: dict[Node, Value] = {
             out.leaf: text.let(
-                f"phi {text.type(out.leaf.dtype)} [{x}, %{before}], [{y}, %{hot_end}]"
+                f"phi {text.type(out.leaf.dtype)} [{x}, %{entry_block}], [{y}, %{hot_end}]"
             )
-            for out, x, y in zip(outs, cold, hot, strict=True)
+            for out, x, y in zip(live_outs, cold_values, hot_values, strict=True)
         }
-        return [chosen.get(out.leaf) or self._stored[cast(Node, out.hot)] for out in gate.outs]
+        return [gate_values.get(out.leaf) or self._stored[cast(Node, out.hot)] for out in gate.outs]
 
     def loop(self, loop: LiveLoop, values: dict[Node, Value]) -> Sequence[Value]:
         """Writes a loop, which ends when no lane goes on or its length is reached."""
@@ -146,74 +146,74 @@ class LLVM(Backend[Value]):
         leaves = self._in_place(loop, values)
         # A loop that runs at least once has its test at the end. It ends with what its last
         # iteration computed, so that a carry that the body does not read needs no phi.
-        at_least_once = bool(loop.length) and loop.active is None
-        without_phi = set(leaves)
-        if at_least_once:
-            without_phi |= liveness.unread(loop)
-        carries = [carry for carry in loop.carries if carry.leaf not in without_phi]
+        has_iteration = bool(loop.length) and loop.active is None
+        place_leaves = set(leaves)
+        if has_iteration:
+            place_leaves |= liveness.unread(loop)
+        carries = [carry for carry in loop.carries if carry.leaf not in place_leaves]
         inits = [self.value(carry.init, values) for carry in carries]
         readers = [self._reader(e.leaf, e.values, values) for e in loop.elements]
-        arrays = [text.reserve(r.value.dtype, loop.length or 0) for r in loop.records]
-        before = text.block
+        record_arrays = [text.reserve(r.value.dtype, loop.length or 0) for r in loop.records]
+        entry_block = text.block
         head = text.label()
-        after = text.label()
+        tail = text.label()
         text.line(f"br label %{head}")
         text.start(head)
         # A phi reads what the body's end computes, and is written when that is known. The first is
         # the number of the iteration.
         holes = [text.hole() for _ in range(len(carries) + 1)]
-        count, *names = [hole.name for hole in holes]
-        leaves.update(zip((carry.leaf for carry in carries), names, strict=True))
+        count, *phi_names = [hole.name for hole in holes]
+        leaves.update(zip((carry.leaf for carry in carries), phi_names, strict=True))
         active = None
         if loop.active is not None:
             active = self.value(loop.carries[loop.active].leaf, leaves)
-        if not at_least_once:
+        if not has_iteration:
             body = text.label()
-            text.line(f"br i1 {self.goes_on(loop, count, active)}, label %{body}, label %{after}")
+            text.line(f"br i1 {self.goes_on(loop, count, active)}, label %{body}, label %{tail}")
             text.start(body)
-        skipped = self.may_skip(active)
+        skip_labels = self.may_skip(active)
         for element, reader in zip(loop.elements, readers, strict=True):
             leaves[element.leaf] = reader(count)
-        inner = self.inside(loop.body, values, leaves)
-        for record, array in zip(loop.records, arrays, strict=True):
+        scope = self.inside(loop.body, values, leaves)
+        for record, array_name in zip(loop.records, record_arrays, strict=True):
             dtype = record.value.dtype
-            text.store(self.value(record.value, inner), text.at(array, dtype, count), dtype)
-        nexts = [self.value(carry.next, inner) for carry in carries]
-        kinds = [text.type(carry.leaf.dtype) for carry in carries]
-        if skipped:
-            nexts = self._joined(*skipped, kinds, names, nexts)
-        nexts = [text.let(f"add i64 {count}, 1"), *nexts]
+            text.store(self.value(record.value, scope), text.at(array_name, dtype, count), dtype)
+        next_values = [self.value(carry.next, scope) for carry in carries]
+        types = [text.type(carry.leaf.dtype) for carry in carries]
+        if skip_labels:
+            next_values = self._joined(*skip_labels, types, phi_names, next_values)
+        next_values = [text.let(f"add i64 {count}, 1"), *next_values]
         branch = f"br label %{head}"
-        if at_least_once:
-            runs_again = self.goes_on(loop, nexts[0], active)
-            branch = f"br i1 {runs_again}, label %{head}, label %{after}"
+        if has_iteration:
+            is_repeated = self.goes_on(loop, next_values[0], active)
+            branch = f"br i1 {is_repeated}, label %{head}, label %{tail}"
         for hole, kind, init, following in zip(
-            holes, ["i64", *kinds], ["0", *inits], nexts, strict=True
+            holes, ["i64", *types], ["0", *inits], next_values, strict=True
         ):
-            text.fill(hole, f"phi {kind} [{init}, %{before}], [{following}, %{text.block}]")
-        text.line(branch + self.BACK)
-        text.start(after)
+            text.fill(hole, f"phi {kind} [{init}, %{entry_block}], [{following}, %{text.block}]")
+        text.line(branch + self.LOOP_HINT)
+        text.start(tail)
         # A loop that is left from its head ends with what the phis there hold. What lies in memory
         # is loaded only where it is read.
-        if at_least_once:
-            finals = [super(LLVM, self).value(carry.next, inner) for carry in loop.carries]
+        if has_iteration:
+            final_values = [super(LLVM, self).value(carry.next, scope) for carry in loop.carries]
         else:
-            finals = [leaves[carry.leaf] for carry in loop.carries]
-        return [*finals, *self._recorded_values(loop, arrays)]
+            final_values = [leaves[carry.leaf] for carry in loop.carries]
+        return [*final_values, *self._recorded_values(loop, record_arrays)]
 
-    def _recorded_values(self, loop: LiveLoop, arrays: list[str]) -> list[Value]:
+    def _recorded_values(self, loop: LiveLoop, record_arrays: list[str]) -> list[Value]:
         """Returns where each iteration's value of each record lies, for what comes after the loop.
 
         Args:
           loop: which has ended.
-          arrays: pointers to the values of each record.
+          record_arrays: pointers to the values of each record.
         """
         places: list[Value] = []
-        for record, array in zip(loop.records, arrays, strict=True):
+        for record, array_name in zip(loop.records, record_arrays, strict=True):
             dtype = record.value.dtype
             for t, out in enumerate(record.outs):
-                self._recorded[out] = (array, t)
-                places.append(Memory(self._text.at(array, dtype, t), dtype))
+                self._recorded[out] = (array_name, t)
+                places.append(Memory(self._text.at(array_name, dtype, t), dtype))
         return places
 
     def _in_place(self, loop: LiveLoop, values: dict[Node, Value]) -> dict[Node, Value]:
@@ -223,7 +223,7 @@ class LLVM(Backend[Value]):
         same body stays where it is.
         """
         accumulators = liveness.accumulators(loop)
-        if len(accumulators) < self.MANY:
+        if len(accumulators) < self.MANY_CARRIES:
             return {}
         places: dict[Node, Value] = {}
         for node, carry in accumulators.items():
@@ -250,16 +250,16 @@ class LLVM(Backend[Value]):
         return None
 
     def _joined(
-        self, before: str, after: str, kinds: list[str], olds: list[str], news: list[str]
+        self, entry: str, exit_label: str, types: list[str], starts: list[str], ends: list[str]
     ) -> list[str]:
         """Ends a body that may have been skipped; returns the carries."""
         text = self._text
         end = text.block
-        text.line(f"br label %{after}")
-        text.start(after)
+        text.line(f"br label %{exit_label}")
+        text.start(exit_label)
         return [
-            text.let(f"phi {kind} [{old}, %{before}], [{new}, %{end}]")
-            for kind, old, new in zip(kinds, olds, news, strict=True)
+            text.let(f"phi {kind} [{start_value}, %{entry}], [{end_value}, %{end}]")
+            for kind, start_value, end_value in zip(types, starts, ends, strict=True)
         ]
 
     def goes_on(self, loop: LiveLoop, count: str, active: str | None) -> str:
@@ -284,40 +284,40 @@ class LLVM(Backend[Value]):
         """
         text = self._text
         dtype = leaf.dtype
-        spaced = liveness.evenly_spaced([_place_in_input(x) for x in row])
-        if spaced:
-            return lambda count: self._place(*spaced, dtype, count)
-        recorded = self._recorded_in_order(row)
-        if recorded is not None:
-            source, first = recorded
+        place = liveness.evenly_spaced([_place_in_input(x) for x in row])
+        if place:
+            return lambda count: self._place(*place, dtype, count)
+        record_place = self._recorded_in_order(row)
+        if record_place is not None:
+            source, start = record_place
 
             def read(count: str) -> Value:
                 index = count
-                if first:
-                    index = text.let(f"sub i64 {first}, {count}")
+                if start:
+                    index = text.let(f"sub i64 {start}, {count}")
                 return Memory(text.at(source, dtype, index), dtype)
 
             return read
         if all(map(is_constant, row)):
-            table = text.table(dtype, [literal(x) for x in row])
-            return lambda count: text.spread(dtype, table, count)
-        array = text.reserve(dtype, len(row))
-        for t, x in enumerate(row):
-            text.store(self.value(x, values), text.at(array, dtype, t), dtype)
-        return lambda count: Memory(text.at(array, dtype, count), dtype)
+            table_name = text.table(dtype, [literal(x) for x in row])
+            return lambda count: text.spread(dtype, table_name, count)
+        array_name = text.reserve(dtype, len(row))
+        for index, x in enumerate(row):
+            text.store(self.value(x, values), text.at(array_name, dtype, index), dtype)
+        return lambda count: Memory(text.at(array_name, dtype, count), dtype)
 
     def _recorded_in_order(self, row: list[Scalar]) -> tuple[str, int] | None:
         """Returns the array in which an earlier loop recorded these values, and where the first is.
 
         They are there from the start on, or backwards to the start; None if they are not.
         """
-        array, first = self._recorded.get(row[0], (None, 0))
-        if array is None:
+        array_name, start = self._recorded.get(row[0], (None, 0))
+        if array_name is None:
             return None
-        step = -1 if first else 1
-        if any(self._recorded.get(x) != (array, first + step * t) for t, x in enumerate(row)):
+        step = -1 if start else 1
+        if any(self._recorded.get(x) != (array_name, start + step * k) for k, x in enumerate(row)):
             return None
-        return array, first
+        return array_name, start
 
     def _place(self, leaf: int, start: int, stride: int, dtype: np.dtype, count: str) -> Value:
         """Returns where in an argument the element of an iteration lies."""

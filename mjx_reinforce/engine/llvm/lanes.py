@@ -9,20 +9,20 @@ from numpy.typing import DTypeLike
 from mjx_reinforce.engine.llvm.text import Text, sign_letter
 
 INFINITY = float("inf")
-#: x + ROUND - ROUND is the integer nearest to a float32 x, |x| < 2^22, and the lowest bits of
-#: x + ROUND are those of that integer.
-ROUND = 1.5 * 2.0**23
+#: With this as c, x + c - c is the integer nearest to a float32 x, |x| < 2^22, and the lowest bits
+#: of x + c are those of that integer.
+ROUND_BITS = 1.5 * 2.0**23
 
-_BITS = {"float32": np.int32, "float64": np.int64, "int32": np.float32, "int64": np.float64}
+_BIT_DTYPES = {"float32": np.int32, "float64": np.int64, "int32": np.float32, "int64": np.float64}
 
 
-def _writes(on_floats: str, on_integers: str = "") -> Any:
+def _writes(float_op: str, integer_op: str = "") -> Any:
     """Returns an operator: an instruction on floats, and one on integers where it is another."""
 
     def operator(x: "Lanes", y: "Lanes | float") -> "Lanes":
-        if x.dtype.kind == "f" or not on_integers:
-            return x.write(on_floats, y)
-        return x.write(on_integers, y)
+        if x.dtype.kind == "f" or not integer_op:
+            return x.write(float_op, y)
+        return x.write(integer_op, y)
 
     return operator
 
@@ -89,16 +89,16 @@ class Lanes:
             instruction = f"icmp {sign_letter(self.dtype)}{predicate}"
         return self.write(instruction, right, dtype=bool)
 
-    def where(self, yes: "Lanes | float", no: "Lanes | float") -> "Lanes":
+    def where(self, x: "Lanes | float", y: "Lanes | float") -> "Lanes":
         """Returns one value where this mask is set and the other where it is not."""
         # One of the two may be a Python number, and then has the dtype of the other.
-        typed = yes if isinstance(yes, Lanes) else no
-        assert isinstance(typed, Lanes)
-        kind = self.text.type(typed.dtype)
-        yes = typed.like(yes)
-        no = typed.like(no)
+        lanes = x if isinstance(x, Lanes) else y
+        assert isinstance(lanes, Lanes)
+        kind = self.text.type(lanes.dtype)
+        x = lanes.like(x)
+        y = lanes.like(y)
         mask = f"{self.text.type(bool)} {self.name}"
-        return typed.named(self.text.let(f"select {mask}, {kind} {yes.name}, {kind} {no.name}"))
+        return lanes.named(self.text.let(f"select {mask}, {kind} {x.name}, {kind} {y.name}"))
 
     def named(self, name: str) -> "Lanes":
         """Returns another operand of this dtype."""
@@ -120,7 +120,7 @@ class Lanes:
 
     def bits(self) -> "Lanes":
         """Returns the same bits as integers, or integers' as floats."""
-        return self.convert("bitcast", _BITS[self.dtype.name])
+        return self.convert("bitcast", _BIT_DTYPES[self.dtype.name])
 
     def polynomial(self, *coefficients: float) -> "Lanes":
         """Returns the polynomial of this with these coefficients, the highest power first."""

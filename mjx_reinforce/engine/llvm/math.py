@@ -8,22 +8,22 @@ zero, as they are in XLA's threads, and an operand below it counts as zero in ``
 import math
 from collections.abc import Callable
 
-from mjx_reinforce.engine.llvm.lanes import INFINITY, ROUND, Lanes
+from mjx_reinforce.engine.llvm.lanes import INFINITY, ROUND_BITS, Lanes
 
 #: What no task and no policy of ours computes with: the C library does, in double precision.
-RARE = ("acosh", "asinh", "atanh", "cbrt", "cosh", "erf", "erfc", "exp2", "sinh")
+RARE_FUNCTIONS = ("acosh", "asinh", "atanh", "cbrt", "cosh", "erf", "erfc", "exp2", "sinh")
 #: The logarithm of 2 in two parts; the first has 9 bits, so that its product with 15 is exact.
 _LN2 = (0.693359375, -2.12194440e-4)
 #: Beyond these, exp is below 2^-126 and above 2^128.
-_LEAST = -87.33654
-_GREATEST = 88.72283
+_EXP_LOW = -87.33654
+_EXP_HIGH = 88.72283
 #: From here on tanh rounds to 1.
 _TANH_IS_1 = 9.02
 #: The smallest normal number.
-_SMALLEST = 2.0**-126
+_MIN_NORMAL = 2.0**-126
 #: The bits of sqrt(1 / 2).
 _SQRT_HALF = 0x3F3504F3
-#: In float64: as ROUND, and the bits of 1 and of sqrt(1 / 2).
+#: In float64: as ``ROUND_BITS``, and the bits of 1 and of sqrt(1 / 2).
 _ROUND_64 = 1.5 * 2.0**52
 _ONE_64 = 1023 << 52
 _SQRT_HALF_64 = 0x3FE6A09E667F3BCD
@@ -36,7 +36,7 @@ _EXP_LESS_1 = (
     4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1,
 )  # fmt: skip
 #: (log(1 + x) - x + x^2 / 2) / x^3. From Cephes, logf.c.
-_LOG = (
+_LOG_SERIES = (
     7.0376836292e-2, -1.1514610310e-1, 1.1676998740e-1, -1.2420140846e-1, 1.4249322787e-1,
     -1.6668057665e-1, 2.0000714765e-1, -2.4999993993e-1, 3.3333331174e-1,
 )  # fmt: skip
@@ -94,10 +94,10 @@ _ERF_INV_TAIL_64 = (
 
 def _reduced(x: Lanes) -> tuple[Lanes, Lanes]:
     """Returns x - n ln 2, within ln 2 / 2, and integers whose last bits are those of n."""
-    rounded = x * (1 / math.log(2)) + ROUND
-    n = rounded - ROUND
+    sum_bits = x * (1 / math.log(2)) + ROUND_BITS
+    n = sum_bits - ROUND_BITS
     # n times the first part of ln 2 does not round; the second part has its further digits.
-    return x - n * _LN2[0] - n * _LN2[1], rounded.bits()
+    return x - n * _LN2[0] - n * _LN2[1], sum_bits.bits()
 
 
 def _exp_less_1(x: Lanes) -> Lanes:
@@ -121,8 +121,8 @@ def exp(x: Lanes) -> Lanes:
     power = _times_power_of_2(_exp_less_1(remainder) + 1, n)
     # Beyond these n is no exponent of a normal number. A NaN is not below the least either, and
     # becomes NaN by the product with infinity.
-    power = (x < _LEAST).where(0.0, power)
-    return (x <= _GREATEST).where(power, x * INFINITY)
+    power = (x < _EXP_LOW).where(0.0, power)
+    return (x <= _EXP_HIGH).where(power, x * INFINITY)
 
 
 def _quarter_of_expm1(x: Lanes) -> Lanes:
@@ -137,7 +137,7 @@ def expm1(x: Lanes) -> Lanes:
     # Below -18 the result rounds to -1, and 2^n would soon be no normal number.
     power_less_1 = _quarter_of_expm1((x < -18.0).where(-18.0, x)) * 4
     # The result has the sign of x; without this, a -0 would become 0.
-    return (x <= _GREATEST).where(power_less_1, x * INFINITY).call("copysign", x)
+    return (x <= _EXP_HIGH).where(power_less_1, x * INFINITY).call("copysign", x)
 
 
 def logistic(x: Lanes) -> Lanes:
@@ -151,19 +151,19 @@ def tanh(x: Lanes) -> Lanes:
     remainder, n = _reduced(size * 2)
     scale = _power_of_2(n)
     # y is higher + (scale - 1): near zero, where the scale is 1, it is higher, and loses no digit.
-    higher = _exp_less_1(remainder) * scale
-    return ((higher + (scale - 1)) / (higher + (scale + 1))).call("copysign", x)
+    exp_term = _exp_less_1(remainder) * scale
+    return ((exp_term + (scale - 1)) / (exp_term + (scale + 1))).call("copysign", x)
 
 
-def _log_of_parts(less_1: Lanes, exponent: Lanes) -> Lanes:
-    """Returns log((less_1 + 1) 2^exponent), sqrt(1 / 2) <= less_1 + 1 < sqrt(2)."""
-    square = less_1 * less_1
-    higher = less_1.polynomial(*_LOG)
+def _log_of_parts(fraction: Lanes, exponent: Lanes) -> Lanes:
+    """Returns log((fraction + 1) 2^exponent), sqrt(1 / 2) <= fraction + 1 < sqrt(2)."""
+    square = fraction * fraction
+    series = fraction.polynomial(*_LOG_SERIES)
     exponent = exponent.convert("sitofp", "float32")
     # Small terms are added first and the largest, n times the first part of ln 2, last: so little
     # is rounded away.
-    higher = higher * (square * less_1) + exponent * _LN2[1]
-    return square * -0.5 + higher + less_1 + exponent * _LN2[0]
+    series = series * (square * fraction) + exponent * _LN2[1]
+    return square * -0.5 + series + fraction + exponent * _LN2[0]
 
 
 def log(x: Lanes) -> Lanes:
@@ -173,7 +173,7 @@ def log(x: Lanes) -> Lanes:
     exponent = (x.bits() - _SQRT_HALF) >> 23
     log = _log_of_parts((x.bits() - (exponent << 23)).bits() - 1, exponent)
     log = (x < INFINITY).where(log, x)
-    return (x < _SMALLEST).where((x <= -_SMALLEST).where(x.like(math.nan), -INFINITY), log)
+    return (x < _MIN_NORMAL).where((x <= -_MIN_NORMAL).where(x.like(math.nan), -INFINITY), log)
 
 
 def log1p(x: Lanes) -> Lanes:
@@ -182,8 +182,8 @@ def log1p(x: Lanes) -> Lanes:
     scale = (0x40800000 - (exponent << 23)).bits()  # 4 / 2^exponent
     # (1 + x) / 2^exponent - 1, where 1 and x are divided each, as 1 + x has lost the digits of a
     # small x.
-    less_1 = (x.bits() - (exponent << 23)).bits() + (scale * 0.25 - 1)
-    log = (x < INFINITY).where(_log_of_parts(less_1, exponent), x)
+    fraction = (x.bits() - (exponent << 23)).bits() + (scale * 0.25 - 1)
+    log = (x < INFINITY).where(_log_of_parts(fraction, exponent), x)
     log = (x > -1.0).where(log, (x < -1.0).where(math.nan, x * INFINITY))
     return log.call("copysign", x)
 
@@ -200,14 +200,14 @@ def erf_inv(x: Lanes) -> Lanes:
 
 def _log2(x: Lanes) -> Lanes:
     """Returns the logarithm to base 2 of x >= 0, float64, to 1e-12; the series of atanh."""
-    # As in ``log``: y is x / 2^n in [sqrt(1 / 2), sqrt(2)), and ``biased`` is n + 1023.
-    above = x.bits() + (_ONE_64 - _SQRT_HALF_64)
-    biased = above.write("lshr", 52)
-    y = (x.bits() - (biased << 52) + _ONE_64).bits()
+    # As in ``log``: y is x / 2^n in [sqrt(1 / 2), sqrt(2)), and ``biased_exponent`` is n + 1023.
+    shifted_bits = x.bits() + (_ONE_64 - _SQRT_HALF_64)
+    biased_exponent = shifted_bits.write("lshr", 52)
+    y = (x.bits() - (biased_exponent << 52) + _ONE_64).bits()
     ratio = (y - 1) / (y + 1)
     series = (ratio * ratio).polynomial(*(2 / math.log(2) / k for k in range(17, 0, -2)))
     # The bits of 2^52 + biased, since AVX2 has no conversion of integers of 64 bits.
-    exponent = (biased | 0x4330000000000000).bits() - (2.0**52 + 1023)
+    exponent = (biased_exponent | 0x4330000000000000).bits() - (2.0**52 + 1023)
     log = series * ratio + exponent
     log = x.compare("eq", 0).where(-INFINITY, log)
     return (x < INFINITY).where(log, x)
@@ -215,11 +215,11 @@ def _log2(x: Lanes) -> Lanes:
 
 def _exp2(x: Lanes) -> Lanes:
     """Returns 2^x of |x| <= 300, float64, to 1e-12; the series."""
-    rounded = x + _ROUND_64
-    remainder = x - (rounded - _ROUND_64)
+    sum_bits = x + _ROUND_64
+    remainder = x - (sum_bits - _ROUND_64)
     powers = range(10, -1, -1)
     series = remainder.polynomial(*(math.log(2) ** k / math.factorial(k) for k in powers))
-    return series * ((rounded.bits() + 1023) << 52).bits()
+    return series * ((sum_bits.bits() + 1023) << 52).bits()
 
 
 def pow(x: Lanes, y: Lanes) -> Lanes:
@@ -247,7 +247,7 @@ _HALF_PI = (1.5703125, 0.0004838267923332751, 2.5633440682570896e-12)
 _LARGE_ANGLE = 1e5
 _SIGN = -(2**31)
 #: The first 192 binary digits of 2^-8 / (2 pi).
-_TURN = (0x0028BE60DB939105, 0x4A7F09D5F47D4D37, 0x7036D8A5664F10E4)
+_TURN_DIGITS = (0x0028BE60DB939105, 0x4A7F09D5F47D4D37, 0x7036D8A5664F10E4)
 #: pi / 2 less its float32.
 _HALF_PI_LOW = -4.371139000186241e-08
 
@@ -260,33 +260,33 @@ def _large(x: Lanes) -> tuple[Lanes, Lanes]:
     """
     bits = x.bits()
     # The mantissa with its leading 1, and at which digit of 1 / (2 pi) the product begins to count.
-    integer = ((bits & 0x7FFFFF) | 0x800000).convert("zext", "int64")
+    mantissa = ((bits & 0x7FFFFF) | 0x800000).convert("zext", "int64")
     start = ((bits >> 23) - (127 + 23 - 8)).convert("zext", "int64")
-    low, middle, high = (start.like(digits) for digits in _TURN)
+    low, middle, high = (start.like(digits) for digits in _TURN_DIGITS)
     is_first = start < 64
-    turn = integer * is_first.where(low, middle).call("fshl", is_first.where(middle, high), start)
+    turn = mantissa * is_first.where(low, middle).call("fshl", is_first.where(middle, high), start)
     # A whole turn is 2^64 here, and wraps around; a quarter is 2^62. Half a quarter rounds n.
     n = (turn + 2**61) >> 62
     # The 32 highest bits of what is left are more than float32 holds.
-    part = ((turn - (n << 62)) >> 32).convert("trunc", "int32").convert("sitofp", "float32")
-    remainder = (x < INFINITY).where(part * (6.283185307179586 / 2**32), math.nan)
+    fraction = ((turn - (n << 62)) >> 32).convert("trunc", "int32").convert("sitofp", "float32")
+    remainder = (x < INFINITY).where(fraction * (6.283185307179586 / 2**32), math.nan)
     return remainder, n.convert("trunc", "int32")
 
 
 def _reduce_angle(x: Lanes) -> tuple[Lanes, Lanes]:
     """Returns x - n pi / 2 within pi / 4 and the last bits of the integer n, for x >= 0."""
-    rounded = x * (2 / 3.141592653589793) + ROUND
-    n = rounded - ROUND
-    small = (x - n * _HALF_PI[0] - n * _HALF_PI[1] - n * _HALF_PI[2], rounded.bits())
+    sum_bits = x * (2 / 3.141592653589793) + ROUND_BITS
+    n = sum_bits - ROUND_BITS
+    small_pair = (x - n * _HALF_PI[0] - n * _HALF_PI[1] - n * _HALF_PI[2], sum_bits.bits())
     is_large = x > _LARGE_ANGLE
-    before = x.text.block
+    entry = x.text.block
     # Large angles are rare and take many operations: a branch that runs if some lane needs it.
     with x.text.when(x.text.any(is_large.name)):
-        large = [is_large.where(*pair) for pair in zip(_large(x), small, strict=True)]
-        inside = x.text.block
+        large_pair = [is_large.where(*pair) for pair in zip(_large(x), small_pair, strict=True)]
+        branch = x.text.block
     remainder, n = (
-        by_parts.named(x.text.phi(by_parts.dtype, {before: by_parts.name, inside: by_digits.name}))
-        for by_parts, by_digits in zip(small, large, strict=True)
+        low_turn.named(x.text.phi(low_turn.dtype, {entry: low_turn.name, branch: high_turn.name}))
+        for low_turn, high_turn in zip(small_pair, large_pair, strict=True)
     )
     return remainder, n
 
@@ -356,11 +356,11 @@ def atan2(y: Lanes, x: Lanes) -> Lanes:
     height = abs(y)
     width = abs(x)
     is_steep = height > width
-    shorter = is_steep.where(width, height)
-    longer = is_steep.where(height, width)
+    short_side = is_steep.where(width, height)
+    long_side = is_steep.where(height, width)
     # C has an angle also where both are infinite or both are zero, where their ratio is NaN.
-    ratio = shorter.compare("eq", longer).where(1.0, shorter / longer)
-    ratio = shorter.compare("eq", 0).where(0.0, ratio)
+    ratio = short_side.compare("eq", long_side).where(1.0, short_side / long_side)
+    ratio = short_side.compare("eq", 0).where(0.0, ratio)
     arc = _atan_to_1(ratio)
     arc = is_steep.where(_quarter_less(arc), arc)
     # By the bit of the sign, as C tells the angle of x = -0 from that of 0.
@@ -385,8 +385,8 @@ def asin(x: Lanes) -> Lanes:
 def acos(x: Lanes) -> Lanes:
     """Returns the arccosine."""
     is_great, arc = _asin_parts(abs(x))
-    beyond_half = (x < 0.0).where(math.pi - arc * 2, arc * 2)
-    return is_great.where(beyond_half, math.pi / 2 - arc.call("copysign", x))
+    obtuse_arc = (x < 0.0).where(math.pi - arc * 2, arc * 2)
+    return is_great.where(obtuse_arc, math.pi / 2 - arc.call("copysign", x))
 
 
 def _library(name: str) -> Callable[..., Lanes]:
@@ -396,8 +396,8 @@ def _library(name: str) -> Callable[..., Lanes]:
         """Calls the function on scalars: it has no form for vectors."""
         text = operands[0].text
         kind = text.type(operands[0].dtype)
-        kinds = ", ".join(["double"] * len(operands))
-        text.declared.add(f"declare double @{name}({kinds})")
+        arg_types = ", ".join(["double"] * len(operands))
+        text.declared.add(f"declare double @{name}({arg_types})")
         if text.lanes == 1:
             arguments = ", ".join(f"double {x.name}" for x in operands)
             return operands[0].named(text.let(f"call double @{name}({arguments})"))
@@ -429,18 +429,18 @@ def _erf_inv(x: Lanes) -> Lanes:
     w = -_library("log1p")(x * -x)
     root = w.call("sqrt")
     central = (w - 3.125).polynomial(*_ERF_INV_CENTRAL_64)
-    middle = (root - 3.25).polynomial(*_ERF_INV_MIDDLE_64)
+    middle_value = (root - 3.25).polynomial(*_ERF_INV_MIDDLE_64)
     tail = (root - 5).polynomial(*_ERF_INV_TAIL_64)
-    inverse = (w < 6.25).where(central, (w < 16.0).where(middle, tail)) * x
+    inverse = (w < 6.25).where(central, (w < 16.0).where(middle_value, tail)) * x
     return abs(x).compare("eq", 1).where(x * INFINITY, inverse)
 
 
-_OF_ANGLES = (acos, asin, atan, atan2, cos, sin, tan)
-_OF_POWERS = (erf_inv, exp, expm1, log, log1p, logistic, pow, tanh)
+_ANGLE_FUNCTIONS = (acos, asin, atan, atan2, cos, sin, tan)
+_POWER_FUNCTIONS = (erf_inv, exp, expm1, log, log1p, logistic, pow, tanh)
 #: name of the operation -> (operands of float32) -> the result
 _FLOAT32: dict[str, Callable[..., Lanes]] = {
-    **{name: _rounded(name) for name in RARE},
-    **{function.__name__: function for function in (*_OF_ANGLES, *_OF_POWERS)},
+    **{name: _rounded(name) for name in RARE_FUNCTIONS},
+    **{function.__name__: function for function in (*_ANGLE_FUNCTIONS, *_POWER_FUNCTIONS)},
 }
 #: What the C library does not have as functions of doubles.
 _FLOAT64: dict[str, Callable[..., Lanes]] = {"erf_inv": _erf_inv, "logistic": _logistic}

@@ -9,13 +9,13 @@ from mjx_reinforce.engine.llvm.lanes import INFINITY, Lanes
 from mjx_reinforce.engine.llvm.math import FUNCTIONS
 from mjx_reinforce.engine.llvm.text import scalar_type, sign_letter
 from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive
-from mjx_reinforce.engine.scalar.nodes import FACTS, Op
+from mjx_reinforce.engine.scalar.nodes import OP_TRAITS, Op
 
 #: (operation, dtype of the result, operands) -> the result
 Emit = Callable[..., Lanes]
 
 #: Which comparison with the second operand the one that is taken meets.
-_ORDERS = {"max": "gt", "min": "lt"}
+_EXTREME_ORDERS = {"max": "gt", "min": "lt"}
 _COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
 
 
@@ -32,25 +32,25 @@ def _extreme(op: Op, dtype: np.dtype, x: Lanes, y: Lanes) -> Lanes:
         return x.call(sign_letter(dtype) + op.name, y)
     if is_constant_text(x.name):
         x, y = y, x
-    order = _ORDERS[op.name]
+    order = _EXTREME_ORDERS[op.name]
     # x is taken where it is NaN, and y, by a comparison that is false, where y is. A constant is
     # not NaN: beside it one comparison, true with NaN, is enough.
     if is_constant_text(y.name):
-        takes_x = x.write(f"fcmp u{order}", y, dtype=bool)
+        is_x = x.write(f"fcmp u{order}", y, dtype=bool)
     else:
-        takes_x = x.compare(order, y) | x.write("fcmp uno", x, dtype=bool)
-    return takes_x.where(x, y)
+        is_x = x.compare(order, y) | x.write("fcmp uno", x, dtype=bool)
+    return is_x.where(x, y)
 
 
 def _select(op: Op, dtype: np.dtype, index: Lanes, *cases: Lanes) -> Lanes:
     """Picks the case that the first operand numbers."""
-    chosen = cases[0]
-    for number, case in enumerate(cases[1:], start=1):
+    selection = cases[0]
+    for case_index, case in enumerate(cases[1:], start=1):
         mask = index
         if index.dtype != np.bool_:
-            mask = index.write("icmp sge", number, dtype=bool)
-        chosen = mask.where(case, chosen)
-    return chosen
+            mask = index.write("icmp sge", case_index, dtype=bool)
+        selection = mask.where(case, selection)
+    return selection
 
 
 def _divide(op: Op, dtype: np.dtype, x: Lanes, y: Lanes) -> Lanes:
@@ -62,20 +62,20 @@ def _divide(op: Op, dtype: np.dtype, x: Lanes, y: Lanes) -> Lanes:
     if dtype.kind == "f":
         return x / y if is_division else x.write("frem", y)
     is_signed = dtype.kind == "i"
-    minus_1 = x.like(~dtype.type(0))  # of unsigned integers the greatest
+    all_ones = x.like(~dtype.type(0))  # of unsigned integers the greatest
 
-    def where_y_is(number: Lanes | int, chosen: Lanes | int, otherwise: Lanes) -> Lanes:
-        return y.compare("eq", number).where(chosen, otherwise)
+    def where_y_is(y_value: Lanes | int, choice: Lanes | int, default: Lanes) -> Lanes:
+        return y.compare("eq", y_value).where(choice, default)
 
     # Lanes whose divisor is 0 or -1 divide by 1 instead, and their results are put in afterwards.
     # The rest of a division by -1 is the same 0 as that by 1.
     divisor = where_y_is(0, 1, y)
     if is_signed:
-        divisor = where_y_is(minus_1, 1, divisor)
+        divisor = where_y_is(all_ones, 1, divisor)
     quotient = x.write(sign_letter(dtype) + op.name, divisor)
     if is_signed and is_division:
-        quotient = where_y_is(minus_1, 0 - x, quotient)
-    return where_y_is(0, minus_1 if is_division else x, quotient)
+        quotient = where_y_is(all_ones, 0 - x, quotient)
+    return where_y_is(0, all_ones if is_division else x, quotient)
 
 
 def _shift(instruction: str) -> Emit:
@@ -83,12 +83,12 @@ def _shift(instruction: str) -> Emit:
 
     def emit(op: Op, dtype: np.dtype, x: Lanes, y: Lanes) -> Lanes:
         """Shifts by y; LLVM leaves a shift by more undefined, and a negative y is more too."""
-        last = dtype.itemsize * 8 - 1
-        inside = y.write("icmp ule", last, dtype=bool)
-        shifted = x.write(instruction, inside.where(y, last))
+        max_shift = dtype.itemsize * 8 - 1
+        is_inside = y.write("icmp ule", max_shift, dtype=bool)
+        shift_value = x.write(instruction, is_inside.where(y, max_shift))
         if instruction == "ashr":
-            return shifted
-        return inside.where(shifted, 0)
+            return shift_value
+        return is_inside.where(shift_value, 0)
 
     return emit
 
@@ -118,8 +118,8 @@ def _unary(intrinsic: str) -> Emit:
 
 
 def _round(op: Op, dtype: np.dtype, x: Lanes) -> Lanes:
-    to_even = int(dict(op.params)["rounding_method"]) == 1  # type: ignore[call-overload]
-    return x.call("roundeven" if to_even else "round")
+    is_to_even = int(dict(op.params)["rounding_method"]) == 1  # type: ignore[call-overload]
+    return x.call("roundeven" if is_to_even else "round")
 
 
 def _count_zeros(op: Op, dtype: np.dtype, x: Lanes) -> Lanes:
@@ -133,21 +133,21 @@ def _count_zeros(op: Op, dtype: np.dtype, x: Lanes) -> Lanes:
 
 def _convert(op: Op, dtype: np.dtype, x: Lanes) -> Lanes:
     """As XLA does it: a float out of an integer's range becomes the nearest, NaN becomes 0."""
-    before = x.dtype
-    widens = dtype.itemsize > before.itemsize
+    source_dtype = x.dtype
+    is_wider = dtype.itemsize > source_dtype.itemsize
     if dtype == np.bool_:
         return x.compare("ne", 0)
     if dtype.kind == "f":
-        if before.kind == "f":
-            return x.convert("fpext" if widens else "fptrunc", dtype)
-        return x.convert(f"{sign_letter(before)}itofp", dtype)
-    if before.kind == "f":
+        if source_dtype.kind == "f":
+            return x.convert("fpext" if is_wider else "fptrunc", dtype)
+        return x.convert(f"{sign_letter(source_dtype)}itofp", dtype)
+    if source_dtype.kind == "f":
         # LLVM's plain conversion is undefined out of the range.
-        return x.named(x.text.saturate(dtype, before, x.name))
+        return x.named(x.text.saturate(dtype, source_dtype, x.name))
     # A bool is a byte in NumPy and a bit here, so that it widens to a byte too.
-    if before == np.bool_ or widens:
-        return x.convert("sext" if before.kind == "i" else "zext", dtype)
-    if scalar_type(dtype) == scalar_type(before):
+    if source_dtype == np.bool_ or is_wider:
+        return x.convert("sext" if source_dtype.kind == "i" else "zext", dtype)
+    if scalar_type(dtype) == scalar_type(source_dtype):
         return x
     return x.convert("trunc", dtype)
 
@@ -174,10 +174,10 @@ def _absent(op: Op, *_: Any) -> Lanes:
 
 
 OPERATIONS: dict[str, Emit] = {
-    **dict.fromkeys(FACTS, _absent),
+    **dict.fromkeys(OP_TRAITS, _absent),
     **dict.fromkeys(FUNCTIONS["float32"], _math),
     **dict.fromkeys(_COMPARISONS, lambda op, _, x, y: x.compare(op.name, y)),
-    **dict.fromkeys(_ORDERS, _extreme),
+    **dict.fromkeys(_EXTREME_ORDERS, _extreme),
     **dict.fromkeys(("div", "rem"), _divide),
     **{name: _unary(name) for name in ("floor", "ceil", "sqrt")},
     "add": lambda op, dtype, x, y: x + y,

@@ -103,7 +103,7 @@ class Text:
 
     def function(self, signature: str) -> str:
         """Returns a module with a function of this signature, such as "void @f(ptr %x)"."""
-        tables = [f"{name} = internal constant {table}" for table, name in self._tables.items()]
+        tables = [f"{name} = internal constant {value}" for value, name in self._tables.items()]
         # What is reserved stands in a block of its own in front: there LLVM turns what is small
         # into registers, and a loop does not reserve it again and again.
         body = ["entry:", *self._reserved, "  br label %start", "start:", *self._lines]
@@ -190,16 +190,16 @@ class Text:
     @contextmanager
     def when(self, condition: str) -> Iterator[None]:
         """Writes what is done only if an i1 is set; what is known before stays known."""
-        inside = self.label()
-        after = self.label()
-        known_before = self._known
-        self.line(f"br i1 {condition}, label %{inside}, label %{after}")
-        self.start(inside)
+        body_label = self.label()
+        end_label = self.label()
+        outer_known = self._known
+        self.line(f"br i1 {condition}, label %{body_label}, label %{end_label}")
+        self.start(body_label)
         yield
-        self.line(f"br label %{after}")
-        self.start(after)
+        self.line(f"br label %{end_label}")
+        self.start(end_label)
         # The block after is entered from the one before alone, or through the one inside.
-        self._known = known_before
+        self._known = outer_known
 
     def hole(self) -> Hole:
         """Leaves a line for an instruction that reads what comes later."""
@@ -226,13 +226,13 @@ class Text:
         """Writes at the function's start what gives a name to so many bytes of the heap."""
         # malloc aligns for the largest scalar alone: room for one more alignment is taken, and the
         # place in it is rounded up.
-        room, number, beyond, aligned = (self.name() for _ in range(4))
+        room, address, end_address, aligned_address = (self.name() for _ in range(4))
         self._reserved += [
             f"  {room} = call ptr @malloc(i64 {size + align})",
-            f"  {number} = ptrtoint ptr {room} to i64",
-            f"  {beyond} = add i64 {number}, {align - 1}",
-            f"  {aligned} = and i64 {beyond}, {-align}",
-            f"  {name} = inttoptr i64 {aligned} to ptr",
+            f"  {address} = ptrtoint ptr {room} to i64",
+            f"  {end_address} = add i64 {address}, {align - 1}",
+            f"  {aligned_address} = and i64 {end_address}, {-align}",
+            f"  {name} = inttoptr i64 {aligned_address} to ptr",
         ]
         self._allocated.append(room)
 
@@ -246,24 +246,24 @@ class Text:
         """Returns a pointer to constant scalars."""
         scalar = scalar_type(dtype)
         entries = ", ".join(f"{scalar} {x}" for x in literals)
-        text = f"[{len(literals)} x {scalar}] [{entries}]"
-        return self._tables.setdefault(text, f"@t{len(self._tables)}")
+        value = f"[{len(literals)} x {scalar}] [{entries}]"
+        return self._tables.setdefault(value, f"@t{len(self._tables)}")
 
-    def spread(self, dtype: DTypeLike, table: str, index: str) -> str:
+    def spread(self, dtype: DTypeLike, table_name: str, index: str) -> str:
         """Returns an entry of a table in every lane."""
         scalar = scalar_type(dtype)
-        place = self.let(f"getelementptr inbounds {scalar}, ptr {table}, i64 {index}")
-        entry = self.let(f"load {scalar}, ptr {place}")
-        return self.broadcast(scalar, entry)
+        place = self.let(f"getelementptr inbounds {scalar}, ptr {table_name}, i64 {index}")
+        element = self.let(f"load {scalar}, ptr {place}")
+        return self.broadcast(scalar, element)
 
     def broadcast(self, scalar: str, value: str) -> str:
         """Returns a scalar in every lane."""
         if self.lanes == 1:
             return value
         kind = f"<{self.lanes} x {scalar}>"
-        first = self.let(f"insertelement {kind} poison, {scalar} {value}, i64 0")
-        none = f"<{self.lanes} x i32> zeroinitializer"
-        return self.let(f"shufflevector {kind} {first}, {kind} poison, {none}")
+        first_lane = self.let(f"insertelement {kind} poison, {scalar} {value}, i64 0")
+        zero_mask = f"<{self.lanes} x i32> zeroinitializer"
+        return self.let(f"shufflevector {kind} {first_lane}, {kind} poison, {zero_mask}")
 
     def at(self, pointer: str, dtype: DTypeLike, index: int | str) -> str:
         """Returns the pointer to a lane vector of an array of them."""
@@ -327,14 +327,14 @@ class Text:
         """Returns an i1: whether a bit of a mask is set."""
         if self.lanes == 1:
             return mask
-        masked = self.let(f"and i{self.lanes} {mask}, {1 << number}")
-        return self.let(f"icmp ne i{self.lanes} {masked}, 0")
+        bit_mask = self.let(f"and i{self.lanes} {mask}, {1 << number}")
+        return self.let(f"icmp ne i{self.lanes} {bit_mask}, 0")
 
-    def saturate(self, dtype: DTypeLike, before: Any, value: str) -> str:
+    def saturate(self, dtype: DTypeLike, source_dtype: Any, value: str) -> str:
         """Converts a float to the nearest integer that there is, and NaN to 0."""
         sign = sign_letter(np.dtype(dtype))
-        new = self.type(dtype)
-        old = self.type(before)
-        name = f"@llvm.fpto{sign}i.sat.{self._suffix(dtype)}.{self._suffix(before)}"
-        self.declared.add(f"declare {new} {name}({old})")
-        return self.let(f"call {new} {name}({old} {value})")
+        target_type = self.type(dtype)
+        source_type = self.type(source_dtype)
+        name = f"@llvm.fpto{sign}i.sat.{self._suffix(dtype)}.{self._suffix(source_dtype)}"
+        self.declared.add(f"declare {target_type} {name}({source_type})")
+        return self.let(f"call {target_type} {name}({source_type} {value})")

@@ -31,12 +31,12 @@ class Group(NamedTuple):
 
     contacts: how many
     pyramid: [rows of a contact, vectors of its basis] the rows as sums of the vectors
-    coupled: [nv, nv] whether rows of one of them may have both degrees of freedom
+    coupling: [nv, nv] whether rows of one of them may have both degrees of freedom
     """
 
     contacts: int
     pyramid: np.ndarray
-    coupled: np.ndarray
+    coupling: np.ndarray
 
 
 class Blocks(NamedTuple):
@@ -71,8 +71,8 @@ def blocks(num_contact_free: int, dims: np.ndarray, couplings: Mapping[int, np.n
     """
     # MJX orders contacts by their dimension, so that each group's rows are next to one another.
     groups = tuple(
-        Group(int((dims == dim).sum()), _pyramid(dim), coupled)
-        for dim, coupled in sorted(couplings.items())
+        Group(int((dims == dim).sum()), _pyramid(dim), coupling)
+        for dim, coupling in sorted(couplings.items())
         if (dims == dim).any()
     )
     return Blocks(num_contact_free, groups)
@@ -83,20 +83,20 @@ def couplings(model: mjx.Model) -> dict[int, np.ndarray]:
 
     A contact's rows have those that move one of its two bodies. The bools are [nv, nv].
     """
-    moves = _moves(model)
+    is_moved = _moves(model)
     couplings: dict[int, np.ndarray] = {}
     for dim, geom1, geom2 in geom_groups(model):
-        either = moves[model.geom_bodyid[geom1]] | moves[model.geom_bodyid[geom2]]
-        couplings[dim] = couplings.get(dim, False) | np.outer(either, either)
+        is_pair_moved = is_moved[model.geom_bodyid[geom1]] | is_moved[model.geom_bodyid[geom2]]
+        couplings[dim] = couplings.get(dim, False) | np.outer(is_pair_moved, is_pair_moved)
     return couplings
 
 
 def _moves(model: mjx.Model) -> np.ndarray:
     """Returns which degrees of freedom move a body, [nbody, nv]."""
-    moves = model.dof_bodyid == np.arange(model.nbody)[:, None]
+    is_moved = model.dof_bodyid == np.arange(model.nbody)[:, None]
     for body in range(1, model.nbody):  # parents come first
-        moves[body] |= moves[model.body_parentid[body]]
-    return moves
+        is_moved[body] |= is_moved[model.body_parentid[body]]
+    return is_moved
 
 
 def _pyramid(dim: int) -> np.ndarray:
@@ -108,40 +108,40 @@ def _pyramid(dim: int) -> np.ndarray:
     return np.hstack([np.ones((len(tangents), 1)), tangents])
 
 
-def with_bases(division: Blocks, rows: jax.Array, touching: jax.Array) -> Jacobian:
+def with_bases(division: Blocks, rows: jax.Array, is_touching: jax.Array) -> Jacobian:
     """Returns the Jacobian of rows [rows, nv].
 
     Args:
       division: of the rows.
       rows: [rows, nv]
-      touching: [C] whether a contact's rows may be other than zero.
+      is_touching: [C] whether a contact's rows may be other than zero.
     """
     if not is_written_out():
         return Jacobian(rows, [])
 
     bases = []
     group_rows = by_group(division, rows)
-    group_touching = _of_groups(division, touching)
-    for group, contact_rows, touches in zip(
-        division.groups, group_rows, group_touching, strict=True
+    touch_masks = _of_groups(division, is_touching)
+    for group, contact_rows, touch_mask in zip(
+        division.groups, group_rows, touch_masks, strict=True
     ):
         # A pyramid's columns are orthogonal: n is the mean of the edges, t_i half a difference.
         inverse = group.pyramid.T / np.sum(group.pyramid**2, 0)[:, None]
         basis = functools.partial(jnp.matmul, jnp.asarray(inverse, rows.dtype))
-        bases.append(_of_touching(basis, contact_rows, touches))
+        bases.append(_of_touching(basis, contact_rows, touch_mask))
     return Jacobian(rows, bases)
 
 
-def _of_touching(function: Callable, rows: jax.Array, touching: jax.Array) -> jax.Array:
+def _of_touching(function: Callable, rows: jax.Array, is_touching: jax.Array) -> jax.Array:
     """Returns a function of the rows of each contact that touches; zeros for the others."""
 
     def apply(_: None, contact: tuple) -> tuple[None, jax.Array]:
-        rows, touches = contact
+        rows, touch = contact
         shape = jax.eval_shape(function, rows)
         zeros = jnp.zeros(shape.shape, shape.dtype)
-        return None, skippable(touches, lambda: function(rows), zeros)
+        return None, skippable(touch, lambda: function(rows), zeros)
 
-    return short_scan(apply, None, (rows, touching))[1]
+    return short_scan(apply, None, (rows, is_touching))[1]
 
 
 def weighted(
@@ -157,9 +157,9 @@ def weighted(
       force: [rows]
     """
     # Where XLA compiles, all rows are one product; written out, contacts follow one by one.
-    dense = slice(division.num_contact_free if is_written_out() else None)
-    rows = jacobian.rows[dense]
-    sums = start + (rows.T * mass[dense]) @ rows, rows.T @ force[dense]
+    dense_rows = slice(division.num_contact_free if is_written_out() else None)
+    rows = jacobian.rows[dense_rows]
+    sums = start + (rows.T * mass[dense_rows]) @ rows, rows.T @ force[dense_rows]
     if not is_written_out():
         return sums
     group_mass = by_group(division, mass)
@@ -182,7 +182,7 @@ def weighted(
                 weights = (pyramid.T * mass) @ pyramid @ basis
                 total = _plus_product(hessian, basis.T[:, None], weights.T[None])
                 return (
-                    jnp.where(group.coupled, total, hessian),
+                    jnp.where(group.coupling, total, hessian),
                     _plus_product(qfrc_constraint, basis.T, pyramid.T @ force),
                 )
 
@@ -193,7 +193,7 @@ def weighted(
 
 
 def along(
-    division: Blocks, jacobian: Jacobian, direction: jax.Array, touching: jax.Array
+    division: Blocks, jacobian: Jacobian, direction: jax.Array, is_touching: jax.Array
 ) -> jax.Array:
     """Returns J direction, [rows].
 
@@ -201,17 +201,17 @@ def along(
       division: of the rows.
       jacobian: of ``with_bases``.
       direction: [nv]
-      touching: [C] whether a contact's rows may be other than zero.
+      is_touching: [C] whether a contact's rows may be other than zero.
     """
     if not is_written_out():
         return jacobian.rows @ direction
 
     products = [jacobian.rows[: division.num_contact_free] @ direction]
-    group_touching = _of_groups(division, touching)
-    for group, bases, touches in zip(division.groups, jacobian.bases, group_touching, strict=True):
+    touch_masks = _of_groups(division, is_touching)
+    for group, bases, touch_mask in zip(division.groups, jacobian.bases, touch_masks, strict=True):
         pyramid = jnp.asarray(group.pyramid, direction.dtype)
         product = lambda basis, pyramid=pyramid: pyramid @ (basis @ direction)  # noqa: E731
-        products.append(_of_touching(product, bases, touches).reshape(-1))
+        products.append(_of_touching(product, bases, touch_mask).reshape(-1))
     return jnp.concatenate(products)
 
 
@@ -226,10 +226,10 @@ def _plus_product(start: jax.Array, factor1: jax.Array, factor2: jax.Array) -> j
     return jnp.einsum("...k,...k->...", terms, factors)
 
 
-def _of_groups(division: Blocks, touching: jax.Array) -> list[jax.Array]:
+def _of_groups(division: Blocks, is_touching: jax.Array) -> list[jax.Array]:
     """Divides an array [C] into the groups' [contacts]."""
     bounds = np.cumsum([0, *(group.contacts for group in division.groups)])
-    return [touching[start:stop] for start, stop in itertools.pairwise(bounds)]
+    return [is_touching[start:stop] for start, stop in itertools.pairwise(bounds)]
 
 
 def by_group(division: Blocks, rows: jax.Array) -> list[jax.Array]:

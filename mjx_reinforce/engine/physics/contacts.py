@@ -53,11 +53,11 @@ from mjx_reinforce.engine.scalar import is_written_out, short_scan
 # between points a few meters from the origin. Axes that cross, as in a planar Hopper, have that.
 _MIN_LENGTH = {"float64": 1e-15, "float32": 2e-6}
 # Capsules are parallel in C (``mjc_segWeights``) below this square of their angle's sine.
-_PARALLEL = 1e-8
+_PARALLEL_SINE_SQUARE = 1e-8
 # The sine of the angle to a cap up to which a capsule lies on it in C.
-_LIES = 0.0888
+_CAP_SINE = 0.0888
 # A distance at which nothing touches, in meters.
-_FAR = 1e3
+_GAP = 1e3
 #: A collision function of MJX: (model, data, key, geoms [P, 2]) -> dist, pos, frame of contacts.
 Collide = Callable[..., Any]
 
@@ -71,9 +71,9 @@ def plane_capsule(plane: GeomInfo, capsule: GeomInfo) -> Collision:
     tangent, _ = _direction(axis - normal * jnp.dot(normal, axis))
     frame = jnp.stack([normal, tangent, jnp.cross(normal, tangent)])
     segment = axis * capsule.size[1]
-    ends = capsule.pos + jnp.stack([segment, -segment])
-    dist = (ends - plane.pos) @ normal - capsule.size[0]
-    pos = ends - normal * (capsule.size[0] + dist[:, None] / 2)
+    end_points = capsule.pos + jnp.stack([segment, -segment])
+    dist = (end_points - plane.pos) @ normal - capsule.size[0]
+    pos = end_points - normal * (capsule.size[0] + dist[:, None] / 2)
     return dist, pos, jnp.stack([frame, frame])
 
 
@@ -82,8 +82,8 @@ def plane_box(plane: GeomInfo, box: GeomInfo) -> Collision:
     """Collides a plane with the lower corner of each of a box's four diagonals."""
     # One corner of each diagonal; the opposite one is its negative. C stops at four contacts, too.
     corners = np.array([[1, 1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, -1]]) * box.size @ box.mat.T
-    up = corners @ plane.mat[:, 2] > 0
-    return _collide_points(plane, box.pos + jnp.where(up[:, None], -corners, corners))
+    is_upper = corners @ plane.mat[:, 2] > 0
+    return _collide_points(plane, box.pos + jnp.where(is_upper[:, None], -corners, corners))
 
 
 @collider(ncon=3)
@@ -101,9 +101,9 @@ def plane_cylinder(plane: GeomInfo, cylinder: GeomInfo) -> Collision:
     down, length = _direction(axis * jnp.dot(axis, normal) - normal)
     down = cylinder.size[0] * jnp.where(length == 0, cylinder.mat[:, 0], down)
     # Three points of the lower rim, 120 degrees apart.
-    across = jnp.cross(down, axis) * np.sqrt(0.75)
+    rim_offset = jnp.cross(down, axis) * np.sqrt(0.75)
     half = cylinder.size[1] * axis
-    rim = half + jnp.stack([down, across - down / 2, -across - down / 2])
+    rim = half + jnp.stack([down, rim_offset - down / 2, -rim_offset - down / 2])
     # The upper rim's lowest point takes the second's place if it is lower, as where it lies.
     upper = down - half
     is_lower = jnp.dot(upper, normal) < jnp.dot(rim[1], normal)
@@ -115,8 +115,8 @@ def sphere_capsule(sphere: GeomInfo, capsule: GeomInfo) -> Collision:
     """Collides a sphere with the point of a capsule's axis that is closest to it."""
     axis = capsule.mat[:, 2]
     half = capsule.size[1]
-    along = jnp.clip(jnp.dot(axis, sphere.pos - capsule.pos), -half, half)
-    return _collide_spheres(sphere, sphere.pos, capsule, capsule.pos + along * axis)
+    axis_place = jnp.clip(jnp.dot(axis, sphere.pos - capsule.pos), -half, half)
+    return _collide_spheres(sphere, sphere.pos, capsule, capsule.pos + axis_place * axis)
 
 
 @collider(ncon=1)
@@ -132,25 +132,25 @@ def _closest_points(capsule1: GeomInfo, capsule2: GeomInfo) -> tuple[jax.Array, 
     axis2 = capsule2.mat[:, 2] * capsule2.size[1]
     offset = capsule1.pos - capsule2.pos
 
-    def meet(along1: float | jax.Array) -> jax.Array:
+    def meet(place1: float | jax.Array) -> jax.Array:
         """Returns a place on the first axis and the closest on the second, in half lengths."""
-        unclipped = jnp.dot(offset + along1 * axis1, axis2) / jnp.dot(axis2, axis2)
-        along2 = jnp.clip(unclipped, -1, 1)
+        foot2 = jnp.dot(offset + place1 * axis1, axis2) / jnp.dot(axis2, axis2)
+        place2 = jnp.clip(foot2, -1, 1)
         # Past the second axis' end, the first place is that closest to the end.
-        back = jnp.dot(along2 * axis2 - offset, axis1) / jnp.dot(axis1, axis1)
-        return jnp.stack([jnp.where(unclipped == along2, along1, jnp.clip(back, -1, 1)), along2])
+        foot1 = jnp.dot(place2 * axis2 - offset, axis1) / jnp.dot(axis1, axis1)
+        return jnp.stack([jnp.where(foot2 == place2, place1, jnp.clip(foot1, -1, 1)), place2])
 
     # Two lines cross where the determinant of ``mjraw_CapsuleCapsule`` is not zero. It is computed
     # as the square of a cross product, which keeps its digits between almost parallel axes.
     normal = jnp.cross(axis1, axis2)
     square = jnp.dot(normal, normal)
     scale = jnp.dot(axis1, axis1) * jnp.dot(axis2, axis2)
-    parallel = square <= _PARALLEL * scale
-    crossing = jnp.dot(normal, jnp.cross(axis2, offset)) / jnp.where(parallel, scale, square)
+    is_parallel = square <= _PARALLEL_SINE_SQUARE * scale
+    crossing = jnp.dot(normal, jnp.cross(axis2, offset)) / jnp.where(is_parallel, scale, square)
     # Parallel axes are closest all along their overlap. C has a contact at each of its ends.
-    middle = (meet(-1.0) + meet(1.0)) / 2
-    along1, along2 = jnp.where(parallel, middle, meet(jnp.clip(crossing, -1, 1)))
-    return capsule1.pos + along1 * axis1, capsule2.pos + along2 * axis2
+    midpoint = (meet(-1.0) + meet(1.0)) / 2
+    place1, place2 = jnp.where(is_parallel, midpoint, meet(jnp.clip(crossing, -1, 1)))
+    return capsule1.pos + place1 * axis1, capsule2.pos + place2 * axis2
 
 
 @collider(ncon=1)
@@ -174,21 +174,21 @@ def capsule_cylinder(capsule: GeomInfo, cylinder: GeomInfo) -> Collision:
     half = capsule.size[1]
     center = (capsule.pos - cylinder.pos) @ cylinder.mat
     axis = capsule.mat[:, 2] @ cylinder.mat
-    along = _closest_along(center, axis, half, cylinder.size)
-    dist, outward = _from_cylinder(center + along * axis, cylinder.size)
-    contact = center + along * axis - outward * (radius + (dist - radius) / 2)
+    axis_place = _closest_along(center, axis, half, cylinder.size)
+    dist, outward = _from_cylinder(center + axis_place * axis, cylinder.size)
+    contact = center + axis_place * axis - outward * (radius + (dist - radius) / 2)
 
     # Two contacts on a cap, at the ends of what the cap holds of the capsule's lowest line.
     cap = jnp.where(outward[2] > 0, 1.0, -1.0) * jnp.eye(3, dtype=axis.dtype)[2]
     line = center - radius * (outward - axis * jnp.dot(axis, outward))
     start, end = _above_polygon(line, axis, half, cylinder.size[0])
-    lies = (jnp.abs(axis[2]) < _LIES) & (outward[2] != 0) & (start < end)
-    ends = line + jnp.stack([start, end])[:, None] * axis
-    depths = ends @ cap - cylinder.size[1]
+    is_flat = (jnp.abs(axis[2]) < _CAP_SINE) & (outward[2] != 0) & (start < end)
+    points = line + jnp.stack([start, end])[:, None] * axis
+    depths = points @ cap - cylinder.size[1]
 
-    dist = jnp.where(lies, depths, jnp.stack([dist - radius, jnp.full((), _FAR, axis.dtype)]))
-    pos = jnp.where(lies, ends - depths[:, None] / 2 * cap, contact)
-    frame = make_frame(-cylinder.mat @ jnp.where(lies, cap, outward))
+    dist = jnp.where(is_flat, depths, jnp.stack([dist - radius, jnp.full((), _GAP, axis.dtype)]))
+    pos = jnp.where(is_flat, points - depths[:, None] / 2 * cap, contact)
+    frame = make_frame(-cylinder.mat @ jnp.where(is_flat, cap, outward))
     return dist, cylinder.pos + pos @ cylinder.mat.T, jnp.stack([frame, frame])
 
 
@@ -199,16 +199,16 @@ def _from_cylinder(point: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Ar
       point: [3] in the cylinder's frame.
       size: the cylinder's radius and half length.
     """
-    upright = jnp.eye(3, dtype=point.dtype)[2]
-    outward, away = _direction(point * (1 - upright))
+    z_axis = jnp.eye(3, dtype=point.dtype)[2]
+    outward, axis_distance = _direction(point * (1 - z_axis))
     # Beyond both the side and the cap the rim is closest; inside, whichever of the two is nearer.
-    side = away - size[0]
+    side = axis_distance - size[0]
     cap = jnp.abs(point[2]) - size[1]
-    outside = jnp.maximum(jnp.stack([side, cap]), 0)
-    length = jnp.sqrt(jnp.dot(outside, outside))
-    nearest = jnp.stack([side >= cap, side < cap]).astype(point.dtype)
-    share = jnp.where(length > 0, outside / jnp.where(length > 0, length, 1), nearest)
-    gradient = share[0] * outward + share[1] * jnp.where(point[2] > 0, upright, -upright)
+    excess = jnp.maximum(jnp.stack([side, cap]), 0)
+    length = jnp.sqrt(jnp.dot(excess, excess))
+    surface_mask = jnp.stack([side >= cap, side < cap]).astype(point.dtype)
+    share = jnp.where(length > 0, excess / jnp.where(length > 0, length, 1), surface_mask)
+    gradient = share[0] * outward + share[1] * jnp.where(point[2] > 0, z_axis, -z_axis)
     return jnp.where(length > 0, length, jnp.maximum(side, cap)), gradient
 
 
@@ -223,19 +223,19 @@ def _closest_along(
     # Slopes between these two count as zero: rounding leaves such of parallel lines.
     levels = jnp.asarray([-1, 1], axis.dtype) * jnp.sqrt(jnp.finfo(axis.dtype).eps)
 
-    def halve(ends: jax.Array, _: None) -> tuple[jax.Array, None]:
-        middle = (ends[0] + ends[1]) / 2
-        points = center + middle[:, None] * axis
+    def halve(span: jax.Array, _: None) -> tuple[jax.Array, None]:
+        places = (span[0] + span[1]) / 2
+        points = center + places[:, None] * axis
         slope = jax.vmap(lambda point: _from_cylinder(point, size)[1])(points) @ axis
-        ahead = slope < levels
-        return jnp.where(ahead, jnp.stack([middle, ends[1]]), jnp.stack([ends[0], middle])), None
+        is_low = slope < levels
+        return jnp.where(is_low, jnp.stack([places, span[1]]), jnp.stack([span[0], places])), None
 
     # Both bisections at once, [lower and upper end, first and last place].
-    ends = half * jnp.asarray([[-1, -1], [1, 1]], axis.dtype)
+    span = half * jnp.asarray([[-1, -1], [1, 1]], axis.dtype)
     # As many halvings as the mantissa has bits: an interval cannot be smaller.
     steps = jnp.finfo(axis.dtype).nmant
     unroll = not is_written_out()  # see `fenced`
-    return jnp.mean(lax.scan(halve, ends, None, steps, unroll=unroll)[0])
+    return jnp.mean(lax.scan(halve, span, None, steps, unroll=unroll)[0])
 
 
 def _above_polygon(
@@ -251,9 +251,9 @@ def _above_polygon(
     room = radius * np.cos(np.pi / 16) - normals @ center[:2]
     speed = normals @ axis[:2]
     # It is in the polygon once it has entered all sides that it goes toward, until it leaves one.
-    meets = room / jnp.where(speed == 0, 1, speed)
-    start = jnp.max(jnp.where(speed < 0, meets, -half))
-    end = jnp.min(jnp.where(speed > 0, meets, half))
+    crossings = room / jnp.where(speed == 0, 1, speed)
+    start = jnp.max(jnp.where(speed < 0, crossings, -half))
+    end = jnp.min(jnp.where(speed > 0, crossings, half))
     is_outside = jnp.any((speed == 0) & (room < 0))
     return jnp.where(is_outside, half, jnp.maximum(start, -half)), jnp.minimum(end, half)
 
@@ -272,8 +272,8 @@ def _collide_spheres(
     """Collides spheres of two geoms' radii about given points."""
     normal, length = _direction(point2 - point1)
     # Points at one place have no direction between them: C then takes that across both axes.
-    across, _ = _direction(jnp.cross(geom1.mat[:, 2], geom2.mat[:, 2]))
-    normal = jnp.where(length == 0, across, normal)
+    fallback_normal, _ = _direction(jnp.cross(geom1.mat[:, 2], geom2.mat[:, 2]))
+    normal = jnp.where(length == 0, fallback_normal, normal)
     dist = length - (geom1.size[0] + geom2.size[0])
     return dist, point1 + normal * (geom1.size[0] + dist / 2), make_frame(normal)
 
@@ -281,10 +281,10 @@ def _collide_spheres(
 def _direction(vector: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Returns a unit vector and the length; the x axis and 0 for what counts as no length."""
     square = jnp.dot(vector, vector)
-    short = square < _MIN_LENGTH[square.dtype.name] ** 2
-    length = jnp.sqrt(jnp.where(short, 1, square))
-    unit = jnp.where(short, jnp.eye(3, dtype=vector.dtype)[0], vector / length)
-    return unit, jnp.where(short, 0, length)
+    is_short = square < _MIN_LENGTH[square.dtype.name] ** 2
+    length = jnp.sqrt(jnp.where(is_short, 1, square))
+    unit = jnp.where(is_short, jnp.eye(3, dtype=vector.dtype)[0], vector / length)
+    return unit, jnp.where(is_short, 0, length)
 
 
 def one_by_one(collide: Collide) -> Collide:
@@ -301,10 +301,10 @@ def one_by_one(collide: Collide) -> Collide:
         if model.npair or not is_written_out():  # pairs have margins of their own
             return collide(model, data, key, geoms)
         geom1, geom2 = geoms.T
-        fields = data.geom_xpos, data.geom_xmat, model.geom_size
+        poses = data.geom_xpos, data.geom_xmat, model.geom_size
         spheres = model.geom_rbound[geom1] + model.geom_rbound[geom2]
         margins = model.geom_margin[geom1] + model.geom_margin[geom2]
-        rows = *(jnp.stack([x[geom1], x[geom2]], 1) for x in fields), spheres, margins
+        rows = *(jnp.stack([x[geom1], x[geom2]], 1) for x in poses), spheres, margins
 
         def collide_pair(
             pos: jax.Array, mat: jax.Array, size: jax.Array, spheres: Any, margin: jax.Array
@@ -349,23 +349,23 @@ _LIKE_C = {
     (mjx.GeomType.CAPSULE, mjx.GeomType.BOX): boxes.capsule_box,
     (mjx.GeomType.BOX, mjx.GeomType.BOX): boxes.box_box,
 }
-_SEARCHED = "which MJX finds in ten steps of a search"
-_FEWER = "of which MJX finds fewer points than C MuJoCo, in other places"
-_OF_MESHES = "SPHERE MESH, CAPSULE MESH, BOX MESH, MESH MESH, PLANE MESH"
-_OF_FIELDS = "HFIELD SPHERE, HFIELD CAPSULE, HFIELD BOX, HFIELD MESH"
-_OF_ELLIPSOIDS = "SPHERE ELLIPSOID, CAPSULE ELLIPSOID, ELLIPSOID ELLIPSOID, ELLIPSOID CYLINDER"
+_SEARCH_REASON = "which MJX finds in ten steps of a search"
+_POINTS_REASON = "of which MJX finds fewer points than C MuJoCo, in other places"
+_MESH_PAIRS = "SPHERE MESH, CAPSULE MESH, BOX MESH, MESH MESH, PLANE MESH"
+_FIELD_PAIRS = "HFIELD SPHERE, HFIELD CAPSULE, HFIELD BOX, HFIELD MESH"
+_ELLIPSOID_PAIRS = "SPHERE ELLIPSOID, CAPSULE ELLIPSOID, ELLIPSOID ELLIPSOID, ELLIPSOID CYLINDER"
 
 
-def _pairs(names: str) -> list[tuple[mjx.GeomType, ...]]:
+def _pairs(pair_names: str) -> list[tuple[mjx.GeomType, ...]]:
     """Returns pairs of types of geoms."""
-    return [tuple(mjx.GeomType[x] for x in pair.split()) for pair in names.split(", ")]
+    return [tuple(mjx.GeomType[x] for x in pair.split()) for pair in pair_names.split(", ")]
 
 
 #: Pairs of types of geoms, in MJX's order, whose contacts are at other places than C's, and how.
 #: ``python -m experiments.checks.contacts`` compares all others with C.
 UNLIKE_C: dict[tuple[mjx.GeomType, ...], str] = {
-    **dict.fromkeys(_pairs(f"{_OF_ELLIPSOIDS}, CYLINDER CYLINDER"), _SEARCHED),
-    **dict.fromkeys(_pairs(f"{_OF_MESHES}, {_OF_FIELDS}"), _FEWER),
+    **dict.fromkeys(_pairs(f"{_ELLIPSOID_PAIRS}, CYLINDER CYLINDER"), _SEARCH_REASON),
+    **dict.fromkeys(_pairs(f"{_MESH_PAIRS}, {_FIELD_PAIRS}"), _POINTS_REASON),
 }
 #: Those that are like C's only without a margin: C leaves out contacts of boxes that an edge keeps
 #: apart by more, and a collision function does not know the margin.
@@ -373,9 +373,9 @@ UNLIKE_C_WITHIN_MARGIN = frozenset(_pairs("BOX BOX"))
 _SOLID_GEOMS = {getattr(mjx.GeomType, x) for x in ("SPHERE", "CAPSULE", "CYLINDER", "BOX")}
 
 
-def _functions(table: dict[Any, Collide]) -> dict[Any, Collide]:
+def _functions(colliders: dict[Any, Collide]) -> dict[Any, Collide]:
     """Returns the collision functions: MJX's, and in their place ours."""
-    functions = table | _LIKE_C
+    functions = colliders | _LIKE_C
     for pair, function in functions.items():
         # A plane has no bounding sphere to compare: its ``geom_rbound`` is zero.
         if set(pair) <= _SOLID_GEOMS:

@@ -28,17 +28,17 @@ from mjx_reinforce.engine.scalar import is_written_out, short_scan
 #: Fewer are few: in the mechanisms of ``experiments/checks/matrix.py`` C takes 6 steps at most, and
 #: evaluates 22 lengths at most for one. Gymnasium's Pusher allows 20 steps; MuJoCo's default is 50
 #: lengths.
-_ENOUGH_STEPS = 20
-_ENOUGH_LENGTHS = 50
+_MANY_STEPS = 20
+_MANY_LENGTHS = 50
 #: mjMINVAL: what C takes for zero.
-_TINY = 1e-15
+_MIN_VALUE = 1e-15
 #: The flag for one island, of which MJX has no name.
 _NO_ISLANDS = int(mujoco.mjtDisableBit.mjDSBL_ISLAND)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def stops_early(model: Any) -> bool:
     """Returns whether a model, C's or MJX's, allows its solver few steps, or lengths of one."""
-    return model.opt.iterations < _ENOUGH_STEPS or model.opt.ls_iterations < _ENOUGH_LENGTHS
+    return model.opt.iterations < _MANY_STEPS or model.opt.ls_iterations < _MANY_LENGTHS
 
 
 class _Islands(NamedTuple):
@@ -90,16 +90,16 @@ class _Bracket(NamedTuple):
     """The state of a line search that has bracketed the root of the slope.
 
     ends: the two ends
-    nexts: of each end a length where the slope may be zero
+    roots: of each end a length where the slope may be zero
     evaluations: [islands] how many lengths were evaluated
-    converged: [islands] whether the search is over
+    is_converged: [islands] whether the search is over
     best: where it ended, if it did
     """
 
     ends: tuple[_Mark, _Mark]
-    nexts: tuple[_Mark, _Mark]
+    roots: tuple[_Mark, _Mark]
     evaluations: jax.Array
-    converged: jax.Array
+    is_converged: jax.Array
     best: _Mark
 
 
@@ -137,41 +137,41 @@ def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.A
 
     def improve(search: _Search) -> _Search:
         """Makes one step of ``mj_solPrimal`` in every island whose search goes on."""
-        before = search.point
-        direction, gradient = newton.newton_direction(problem, before)
+        old_point = search.point
+        direction, gradient = newton.newton_direction(problem, old_point)
         if islands.size > 1:
             direction = jnp.where(islands.dofs < islands.size, direction, 0)
         # C's tests after a step, here before the next. Before the very first step it has no
         # improvement to look at, and ends only if gradient and decrement both are small.
-        small_gradient = scale * jnp.sqrt(islands.total(gradient**2, islands.dofs)) < tolerance
+        has_small_gradient = scale * jnp.sqrt(islands.total(gradient**2, islands.dofs)) < tolerance
         decrement = -islands.total(gradient * direction, islands.dofs) / 2
-        small_decrement = jnp.maximum(scale * decrement, 0) < tolerance
+        has_small_decrement = jnp.maximum(scale * decrement, 0) < tolerance
         gain = scale * search.improvement
-        converged = small_gradient | small_decrement | ((gain > 0) & (gain < tolerance))
-        is_first = search.steps == 0
-        at_optimum = small_gradient & small_decrement
-        is_active = search.is_active & ~jnp.where(is_first, at_optimum, converged)
+        is_converged = has_small_gradient | has_small_decrement | ((gain > 0) & (gain < tolerance))
+        is_first_step = search.steps == 0
+        is_optimum = has_small_gradient & has_small_decrement
+        is_active = search.is_active & ~jnp.where(is_first_step, is_optimum, is_converged)
 
         # One line for each island: the Hessian couples no two, so that their lengths may differ.
         change = problem.along(direction)
         change_of_imbalance = inertia @ direction
         norm = jnp.sqrt(islands.total(direction**2, islands.dofs))
-        slope = islands.total(direction * before.imbalance, islands.dofs)
+        slope = islands.total(direction * old_point.imbalance, islands.dofs)
         curvature = islands.total(direction * change_of_imbalance, islands.dofs)
-        mark_at = _along(rows, islands, before.residual, change, slope, curvature)
+        mark_at = _along(rows, islands, old_point.residual, change, slope, curvature)
         # ``gtol`` of ``PrimalSearch``.
         slope_tolerance = tolerance * model.opt.ls_tolerance * norm / scale
-        best = _line_search(mark_at, slope_tolerance, model.opt.ls_iterations)
+        best_mark = _line_search(mark_at, slope_tolerance, model.opt.ls_iterations)
         # A length of zero ends an island's search: it has converged, or there is no better point.
-        length = jnp.where(is_active & (norm >= _TINY), best.length, 0)
+        length = jnp.where(is_active & (norm >= _MIN_VALUE), best_mark.length, 0)
         dof_length = islands.spread(length, islands.dofs)
         row_length = islands.spread(length, islands.rows)
-        after = newton.Point(
-            before.qacc + dof_length * direction,
-            before.imbalance + dof_length * change_of_imbalance,
-            before.residual + row_length * change,
+        new_point = newton.Point(
+            old_point.qacc + dof_length * direction,
+            old_point.imbalance + dof_length * change_of_imbalance,
+            old_point.residual + row_length * change,
         )
-        return _Search(after, -best.cost, search.steps + 1, is_active & (length != 0))
+        return _Search(new_point, -best_mark.cost, search.steps + 1, is_active & (length != 0))
 
     start = newton.start(model, data, problem)
     if islands.size > 1:  # what no row holds is not the solver's
@@ -188,9 +188,9 @@ def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.A
 def _released(data: mjx.Data, islands: _Islands, point: newton.Point) -> newton.Point:
     """Returns a point with the unconstrained acceleration where there is no island."""
     # As the end of C's ``warmstart``; there the imbalance is that of ``qacc_smooth``, zero.
-    free = islands.dofs == islands.size
-    qacc = jnp.where(free, data.qacc_smooth, point.qacc)
-    return point._replace(qacc=qacc, imbalance=jnp.where(free, 0, point.imbalance))
+    is_free = islands.dofs == islands.size
+    qacc = jnp.where(is_free, data.qacc_smooth, point.qacc)
+    return point._replace(qacc=qacc, imbalance=jnp.where(is_free, 0, point.imbalance))
 
 
 def _islands(model: mjx.Model, jacobian: jax.Array) -> _Islands:
@@ -200,22 +200,22 @@ def _islands(model: mjx.Model, jacobian: jax.Array) -> _Islands:
     if num_trees == 1 or model.opt.disableflags & _NO_ISLANDS:
         return _Islands(1, np.zeros(len(trees), int), np.zeros(len(jacobian), int))
 
-    def join(joined: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def join(is_joined: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Joins trees [trees, trees] that rows hold together; returns which rows hold which."""
-        holds = jnp.stack([jnp.any(rows[:, trees == t] != 0, 1) for t in range(num_trees)])
-        return joined | jnp.any(holds[:, None] & holds[None], -1), holds
+        is_held = jnp.stack([jnp.any(rows[:, trees == tree] != 0, 1) for tree in range(num_trees)])
+        return is_joined | jnp.any(is_held[:, None] & is_held[None], -1), is_held
 
     # LLVM takes minutes for thousands of bools that are joined in one block.
     blocks = jacobian[:, None] if is_written_out() else jacobian[None]
-    joined, block_holds = short_scan(join, jnp.zeros((num_trees, num_trees), bool), blocks)
-    holds = jnp.moveaxis(block_holds, 0, 1).reshape(num_trees, -1)
+    is_joined, block_holds = short_scan(join, jnp.zeros((num_trees, num_trees), bool), blocks)
+    is_held = jnp.moveaxis(block_holds, 0, 1).reshape(num_trees, -1)
     # The transitive closure, for which ``mj_island`` walks a graph: each squaring joins trees
     # through one more tree, three more, ...
     for _ in range(math.ceil(math.log2(num_trees))):
-        joined = jnp.any(joined[:, :, None] & joined[None], 1)
+        is_joined = jnp.any(is_joined[:, :, None] & is_joined[None], 1)
     # An island's number is that of its first tree, so that many numbers name none.
-    label = jnp.min(jnp.where(joined, jnp.arange(num_trees), num_trees), 1)
-    row_label = jnp.min(jnp.where(holds, label[:, None], num_trees), 0)
+    label = jnp.min(jnp.where(is_joined, jnp.arange(num_trees), num_trees), 1)
+    row_label = jnp.min(jnp.where(is_held, label[:, None], num_trees), 0)
     return _Islands(num_trees, label[trees], row_label)
 
 
@@ -224,7 +224,7 @@ def _scale(model: mjx.Model, inertia: jax.Array, islands: _Islands) -> jax.Array
     if model.opt.disableflags & _NO_ISLANDS:
         return 1 / jnp.full(1, model.stat.meaninertia * max(1, model.nv), inertia.dtype)
     # Numbers that name no island have a trace of zero.
-    return 1 / jnp.maximum(islands.total(jnp.diagonal(inertia), islands.dofs), _TINY)
+    return 1 / jnp.maximum(islands.total(jnp.diagonal(inertia), islands.dofs), _MIN_VALUE)
 
 
 def _along(
@@ -257,9 +257,9 @@ def _along(
         """Returns the mark at a length of each island's step, as C's ``PrimalEval``."""
         if is_written_out():  # hundreds of rows, at seven places
             zeros = jnp.zeros((3, *length.shape), residual.dtype)
-            row_by_row = jax.tree.map(lambda x: x[:, None], all_rows)
-            add = lambda sums, row: (sums + _of_rows(islands, length, *row), None)  # noqa: E731
-            work, push, stiffness = short_scan(add, zeros, row_by_row)[0]
+            single_rows = jax.tree.map(lambda x: x[:, None], all_rows)
+            add_row = lambda sums, row: (sums + _of_rows(islands, length, *row), None)  # noqa: E731
+            work, push, stiffness = short_scan(add_row, zeros, single_rows)[0]
         else:
             work, push, stiffness = _of_rows(islands, length, *all_rows)
         total_curvature = curvature + stiffness
@@ -267,7 +267,7 @@ def _along(
             length=length,
             cost=length * (slope + length * curvature / 2) + work,
             slope=slope + length * curvature - push,
-            curvature=jnp.where(total_curvature > 0, total_curvature, _TINY),
+            curvature=jnp.where(total_curvature > 0, total_curvature, _MIN_VALUE),
         )
 
     return mark_at
@@ -286,23 +286,23 @@ def _of_rows(
     Arguments are those of ``_along``, and the rows' islands; the result is [3, islands].
     """
     step = islands.spread(length, labels) * change
-    after = residual + step
-    force = rows.force(after)
+    end_residual = residual + step
+    force = rows.force(end_residual)
     # The difference of two costs has no digits where a row stays what it is. There the force is
     # linear in the step, and its mean gives the work, as in C's ``frictionCostDif``.
     work = jnp.where(
-        rows.alike(after, residual),
+        rows.alike(end_residual, residual),
         -(rows.force(residual) + force) * step / 2,
-        (rows.cost(after) - rows.cost(residual)) / 2,
+        (rows.cost(end_residual) - rows.cost(residual)) / 2,
     )
-    stiffness = jnp.where(rows.active(after), rows.constraint_mass * change**2, 0)
+    stiffness = jnp.where(rows.active(end_residual), rows.constraint_mass * change**2, 0)
     sums = [islands.total(x, labels) for x in (work, force * change, stiffness)]
     return jnp.stack(sums)
 
 
-def _chosen(condition: jax.Array, yes: Any, no: Any) -> Any:
+def _chosen(condition: jax.Array, state_if_true: Any, state_if_false: Any) -> Any:
     """Returns one of two states for each island."""
-    return jax.tree.map(lambda y, n: jnp.where(condition, y, n), yes, no)
+    return jax.tree.map(lambda y, n: jnp.where(condition, y, n), state_if_true, state_if_false)
 
 
 def _line_search(
@@ -318,35 +318,35 @@ def _line_search(
       slope_tolerance: [islands] a slope that is smaller counts as zero.
       max_lengths: how many lengths it may evaluate, more or less: it looks after each round.
     """
-    zero = mark_at(jnp.zeros_like(slope_tolerance))
-    newton_step = mark_at(zero.next)
-    toward_root = jnp.where(newton_step.slope < 0, 1, -1)
-    converged = jnp.abs(newton_step.slope) < slope_tolerance
-    converged = converged & ((newton_step.length == 0) | (newton_step.cost < 0))
+    start_mark = mark_at(jnp.zeros_like(slope_tolerance))
+    newton_step = mark_at(start_mark.next)
+    root_sign = jnp.where(newton_step.slope < 0, 1, -1)
+    is_converged = jnp.abs(newton_step.slope) < slope_tolerance
+    is_converged = is_converged & ((newton_step.length == 0) | (newton_step.cost < 0))
 
     def goes_on(state: tuple) -> jax.Array:
-        mark, _, evaluations, converged = state
-        before_root = ~converged & (mark.slope * toward_root <= -slope_tolerance)
-        return before_root & (evaluations < max_lengths)
+        mark, _, evaluations, is_converged = state
+        is_before_root = ~is_converged & (mark.slope * root_sign <= -slope_tolerance)
+        return is_before_root & (evaluations < max_lengths)
 
     def follow(state: tuple) -> tuple:
         """Makes the next Newton step along the line, where an island's search goes on."""
-        mark, _, evaluations, converged = state
-        new = mark_at(mark.next)
-        converged = converged | ((jnp.abs(new.slope) < slope_tolerance) & (new.cost < 0))
-        return _chosen(goes_on(state), (new, mark, evaluations + 1, converged), state)
+        mark, _, evaluations, is_converged = state
+        trial = mark_at(mark.next)
+        is_converged = is_converged | ((jnp.abs(trial.slope) < slope_tolerance) & (trial.cost < 0))
+        return _chosen(goes_on(state), (trial, mark, evaluations + 1, is_converged), state)
 
     # C counts lengths one by one; two are evaluated above.
-    state = newton_step, zero, jnp.full(slope_tolerance.shape, 2, jnp.int32), converged
+    state = newton_step, start_mark, jnp.full(slope_tolerance.shape, 2, jnp.int32), is_converged
     state = jax.lax.while_loop(lambda state: jnp.any(goes_on(state)), follow, state)
-    last, previous, evaluations, converged = state
+    last_mark, previous_mark, evaluations, is_converged = state
     # The last two marks, between which the slope changes its sign: p1 and p2 in C.
     bracket = _Bracket(
-        ends=(last, previous),
-        nexts=(mark_at(last.next), last),
+        ends=(last_mark, previous_mark),
+        roots=(mark_at(last_mark.next), last_mark),
         evaluations=evaluations + 1,
-        converged=converged | (evaluations >= max_lengths),
-        best=last,
+        is_converged=is_converged | (evaluations >= max_lengths),
+        best=last_mark,
     )
     return _bracketed(mark_at, slope_tolerance, max_lengths, bracket)
 
@@ -360,46 +360,46 @@ def _bracketed(
     """Returns where the line search ends, from a bracket; otherwise as ``_line_search``."""
 
     def goes_on(state: _Bracket) -> jax.Array:
-        return ~state.converged & (state.evaluations < max_lengths)
+        return ~state.is_converged & (state.evaluations < max_lengths)
 
     def narrow(state: _Bracket) -> _Bracket:
         """Makes one round of C's bracketed search, where an island's goes on."""
         low, high = state.ends
-        middle = mark_at((low.length + high.length) / 2)
-        candidates = *state.nexts, middle
+        middle_mark = mark_at((low.length + high.length) / 2)
+        candidates = *state.roots, middle_mark
 
         # Of the candidates with a slope of zero the one of least cost ends the search.
         is_flat = jnp.zeros(slope_tolerance.shape, bool)
-        best = middle
+        best_mark = middle_mark
         for mark in candidates:
             is_root = jnp.abs(mark.slope) < slope_tolerance
-            is_better = is_root & (~is_flat | (mark.cost < best.cost))
+            is_better = is_root & (~is_flat | (mark.cost < best_mark.cost))
             is_flat = is_flat | is_better
-            best = _chosen(is_better, mark, best)
+            best_mark = _chosen(is_better, mark, best_mark)
 
         # ``updateBracket``: each end goes to the candidate on its side of the root that is nearest.
         # Where neither moves, rounding has the rest, and C takes the middle.
-        ends = []
-        nexts = []
+        marks = []
+        roots = []
         evaluations = state.evaluations + 1
         is_stuck = True
-        for end, end_next in zip(state.ends, state.nexts, strict=True):
-            new = end
+        for end, next_mark in zip(state.ends, state.roots, strict=True):
+            new_end = end
             for mark in candidates:
-                same_side = mark.slope * new.slope > 0
-                closer = same_side & (jnp.abs(mark.slope) < jnp.abs(new.slope))
-                new = _chosen(closer, mark, new)
-            moved = new.slope != end.slope
-            ends.append(new)
-            nexts.append(_chosen(moved, mark_at(new.next), end_next))
-            evaluations = evaluations + moved
-            is_stuck = is_stuck & ~moved
-        narrowed = _Bracket(tuple(ends), tuple(nexts), evaluations, is_flat | is_stuck, best)
-        return _chosen(goes_on(state), narrowed, state)
+                is_same_side = mark.slope * new_end.slope > 0
+                is_closer = is_same_side & (jnp.abs(mark.slope) < jnp.abs(new_end.slope))
+                new_end = _chosen(is_closer, mark, new_end)
+            has_moved = new_end.slope != end.slope
+            marks.append(new_end)
+            roots.append(_chosen(has_moved, mark_at(new_end.next), next_mark))
+            evaluations = evaluations + has_moved
+            is_stuck = is_stuck & ~has_moved
+        inner = _Bracket(tuple(marks), tuple(roots), evaluations, is_flat | is_stuck, best_mark)
+        return _chosen(goes_on(state), inner, state)
 
     bracket = jax.lax.while_loop(lambda state: jnp.any(goes_on(state)), narrow, bracket)
     # Out of lengths, C takes the end of least cost, or no step if neither lowers the cost.
     low, high = bracket.ends
-    best = _chosen(low.cost <= high.cost, low, high)
-    best = _chosen(best.cost < 0, best, jax.tree.map(jnp.zeros_like, best))
-    return _chosen(bracket.converged, bracket.best, best)
+    best_end = _chosen(low.cost <= high.cost, low, high)
+    best_end = _chosen(best_end.cost < 0, best_end, jax.tree.map(jnp.zeros_like, best_end))
+    return _chosen(bracket.is_converged, bracket.best, best_end)

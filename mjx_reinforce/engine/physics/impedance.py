@@ -34,7 +34,7 @@ def make_constraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Makes the constraint rows: where every solimp rises, those of ``mjx.make_constraint``."""
     if _rises(model):
         return mjx.make_constraint(model, data)
-    return _with_falls(model, data)
+    return _rows_with_falls(model, data)
 
 
 def _rises(model: mjx.Model) -> bool:
@@ -53,15 +53,15 @@ def _impedance(model: mjx.Model, solref: jax.Array, solimp: jax.Array, pos: jax.
       solimp: [5]
       pos: [] the distance.
     """
-    stiffness, damping, rising = mjx_internals.kbi(model, solref, solimp, pos)
+    stiffness, damping, rise = mjx_internals.kbi(model, solref, solimp, pos)
     # C clips dmin and dmax (``getsolparam``); MJX also clips what is between them.
     low, high = jnp.clip(solimp[:2], _C.mjMINIMP, _C.mjMAXIMP)
     # A fall is the mirror image of the rise between the same two numbers.
-    swapped = solimp.at[:2].set(solimp[1::-1])
-    falling = low + high - mjx_internals.kbi(model, solref, swapped, pos)[2]
-    impedance = jnp.where(low > high, falling, rising)
-    flat = solimp[2] <= _C.mjMINVAL
-    return stiffness, damping, jnp.where(flat, (low + high) / 2, impedance)
+    mirror_solimp = solimp.at[:2].set(solimp[1::-1])
+    fall = low + high - mjx_internals.kbi(model, solref, mirror_solimp, pos)[2]
+    impedance = jnp.where(low > high, fall, rise)
+    is_flat = solimp[2] <= _C.mjMINVAL
+    return stiffness, damping, jnp.where(is_flat, (low + high) / 2, impedance)
 
 
-_with_falls = mjx_internals.rows_with(_impedance)
+_rows_with_falls = mjx_internals.rows_with(_impedance)

@@ -70,10 +70,10 @@ def euler(model: mjx.Model, data: mjx.Data, balanced: bool = True) -> mjx.Data:
         return mjx.euler(model, data)
 
     # ``mj_EulerSkip``: damping at the step's end makes the matrix M + h diag(B).
-    damped = mjx.full_m(model, data) + jnp.diag(model.opt.timestep * model.dof_damping)
+    damped_mass = mjx.full_m(model, data) + jnp.diag(model.opt.timestep * model.dof_damping)
     force = data.qfrc_smooth + data.qfrc_constraint
 
-    qacc = solve(damped, force)
+    qacc = solve(damped_mass, force)
     if not balanced:
         qacc = jnp.where(jnp.any(model.dof_damping > 0), qacc, data.qacc)
     return advance(model, data, data.act_dot, qacc)
@@ -106,20 +106,20 @@ def implicitfast(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def _velocity_derivative(model: mjx.Model, data: mjx.Data) -> jax.Array:
     """Returns the derivative of the actuators' and dampers' forces by velocity, [nv, nv]."""
     # ``mjd_passive_vel``: of joints and tendons.
-    fields = jax_fields(data)
-    damping = (fields.ten_J.T * model.tendon_damping) @ fields.ten_J
+    impl = jax_fields(data)
+    damping = (impl.ten_J.T * model.tendon_damping) @ impl.ten_J
     derivative = -jnp.diag(model.dof_damping) - damping
     if model.opt.disableflags & mjx.DisableBit.ACTUATION:
         return derivative
 
     # ``mjd_actuator_vel``: a force is gain * signal + bias, of which both may depend on velocity.
-    affine = model.actuator_gaintype == mjx.GainType.AFFINE
-    gain = jnp.where(affine, model.actuator_gainprm[:, 2], 0)
+    is_affine = model.actuator_gaintype == mjx.GainType.AFFINE
+    gain = jnp.where(is_affine, model.actuator_gainprm[:, 2], 0)
     muscles = np.flatnonzero(model.actuator_gaintype == mjx.GainType.MUSCLE)
     if muscles.size:
         muscle_gain = jax.vmap(jax.grad(mjx_internals.muscle_gain, argnums=1))(
             data.actuator_length[muscles],
-            fields.actuator_velocity[muscles],
+            impl.actuator_velocity[muscles],
             jnp.asarray(model.actuator_lengthrange)[muscles],
             jnp.asarray(model.actuator_acc0)[muscles],
             model.actuator_gainprm[muscles],
@@ -128,16 +128,16 @@ def _velocity_derivative(model: mjx.Model, data: mjx.Data) -> jax.Array:
     # The signal is the activation where an actuator has one: the last of its own.
     signal = data.ctrl
     if not model.opt.disableflags & mjx.DisableBit.CLAMPCTRL:
-        limited = jnp.asarray(model.actuator_ctrllimited) != 0
-        signal = jnp.where(limited, jnp.clip(signal, *model.actuator_ctrlrange.T), signal)
+        is_limited = jnp.asarray(model.actuator_ctrllimited) != 0
+        signal = jnp.where(is_limited, jnp.clip(signal, *model.actuator_ctrlrange.T), signal)
     if model.na:
-        last = model.actuator_actadr + model.actuator_actnum - 1
-        signal = jnp.where(model.actuator_actadr == -1, signal, data.act[last])
-    affine = model.actuator_biastype == mjx.BiasType.AFFINE
-    rate = gain * signal + jnp.where(affine, model.actuator_biasprm[:, 2], 0)
+        last_act = model.actuator_actadr + model.actuator_actnum - 1
+        signal = jnp.where(model.actuator_actadr == -1, signal, data.act[last_act])
+    is_affine = model.actuator_biastype == mjx.BiasType.AFFINE
+    force_rate = gain * signal + jnp.where(is_affine, model.actuator_biasprm[:, 2], 0)
     # A force at an end of its range does not change with velocity; MJX counts it all the same.
-    rate = jnp.where(_clamped(model, data), 0, rate)
-    return derivative + (fields.actuator_moment.T * rate) @ fields.actuator_moment
+    force_rate = jnp.where(_clamped(model, data), 0, force_rate)
+    return derivative + (impl.actuator_moment.T * force_rate) @ impl.actuator_moment
 
 
 def _clamped(model: mjx.Model, data: mjx.Data) -> jax.Array:
@@ -148,36 +148,36 @@ def _clamped(model: mjx.Model, data: mjx.Data) -> jax.Array:
     """
 
     def at_end(
-        force: jax.Array, limited: np.ndarray, ends: jax.Array, slack: float = 0
+        force: jax.Array, is_limited: np.ndarray, ranges: jax.Array, slack: float = 0
     ) -> jax.Array:
         """Returns which forces are at an end of their range, by a share of it as slack."""
-        low, high = ends.T
-        beyond = (force <= low + slack * jnp.abs(low)) | (force >= high - slack * jnp.abs(high))
-        return beyond & (jnp.asarray(limited) != 0)
+        low, high = ranges.T
+        is_outside = (force <= low + slack * jnp.abs(low)) | (force >= high - slack * jnp.abs(high))
+        return is_outside & (jnp.asarray(is_limited) != 0)
 
     # Which joint, [nu, njnt], or tendon, [nu, ntendon], an actuator moves.
     force = data.actuator_force
     trntype = model.actuator_trntype
     target = model.actuator_trnid[:, :1]
-    moves_joint = np.isin(trntype, (mjx.TrnType.JOINT, mjx.TrnType.JOINTINPARENT))[:, None]
-    of_joint = moves_joint & (target == np.arange(model.njnt))
-    of_tendon = (trntype == mjx.TrnType.TENDON)[:, None] & (target == np.arange(model.ntendon))
+    is_joint = np.isin(trntype, (mjx.TrnType.JOINT, mjx.TrnType.JOINTINPARENT))[:, None]
+    joint_mask = is_joint & (target == np.arange(model.njnt))
+    tendon_mask = (trntype == mjx.TrnType.TENDON)[:, None] & (target == np.arange(model.ntendon))
     joint_force = data.qfrc_actuator[model.jnt_dofadr]
     # A tendon's forces are scaled to its limit, and their sum is rounded.
     rounding = max(1e-10, 10 * float(jnp.finfo(force.dtype).eps))
     actuator_at_end = at_end(force, model.actuator_forcelimited, model.actuator_forcerange)
     joint_at_end = at_end(joint_force, model.jnt_actfrclimited, model.jnt_actfrcrange)
-    tendon_at_end = of_tendon & at_end(
-        force @ of_tendon, model.tendon_actfrclimited, model.tendon_actfrcrange, rounding
+    tendon_at_end = tendon_mask & at_end(
+        force @ tendon_mask, model.tendon_actfrclimited, model.tendon_actfrcrange, rounding
     )
-    return actuator_at_end | (of_joint & joint_at_end).any(1) | tendon_at_end.any(1)
+    return actuator_at_end | (joint_mask & joint_at_end).any(1) | tendon_at_end.any(1)
 
 
 def _free_bodies(model: mjx.Model) -> list[int]:
     """Returns the bodies whose free joint is alone in their tree; others may be fixed to them."""
-    is_alone = np.bincount(model.dof_treeid) == 6
+    is_single_body = np.bincount(model.dof_treeid) == 6
     dofadr = model.jnt_dofadr[model.jnt_type == mjx.JointType.FREE]
-    return model.dof_bodyid[dofadr[is_alone[model.dof_treeid[dofadr]]]].tolist()
+    return model.dof_bodyid[dofadr[is_single_body[model.dof_treeid[dofadr]]]].tolist()
 
 
 def _bias_derivative(model: mjx.Model, data: mjx.Data, body: int, dofs: np.ndarray) -> jax.Array:
@@ -188,9 +188,9 @@ def _bias_derivative(model: mjx.Model, data: mjx.Data, body: int, dofs: np.ndarr
     frame = data.xmat[body].reshape(3, 3)
     arm = data.subtree_com[body] - data.xpos[body]
 
-    def bias(turning: jax.Array) -> jax.Array:
+    def bias(velocity: jax.Array) -> jax.Array:
         """Returns the centrifugal force in the world, and the torque in the body's frame, [6]."""
-        spin = frame @ turning
+        spin = frame @ velocity
         push = jax_fields(data).crb[body, 9] * jnp.cross(spin, jnp.cross(spin, arm))
         torque = jnp.cross(arm, push) + jnp.cross(spin, inertia @ spin)
         return jnp.concatenate([push, frame.T @ torque])
@@ -198,13 +198,13 @@ def _bias_derivative(model: mjx.Model, data: mjx.Data, body: int, dofs: np.ndarr
     return jax.jacfwd(bias)(data.qvel[dofs[3:]])
 
 
-def _solve_in_halves(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """Returns inv(matrix) right, [6], for a matrix [6, 6] whose first half is positive definite."""
+def _solve_in_halves(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
+    """Returns inv(matrix) rhs, [6], for a matrix [6, 6] whose first half is positive definite."""
     # The first half is eliminated as a block: the second is left with its Schur complement.
     inverse = _inverse(matrix[:3, :3])
-    across = matrix[3:, :3] @ inverse
-    last = _inverse(matrix[3:, 3:] - across @ matrix[:3, 3:]) @ (right[3:] - across @ right[:3])
-    return jnp.concatenate([inverse @ (right[:3] - matrix[:3, 3:] @ last), last])
+    ratio = matrix[3:, :3] @ inverse
+    lower = _inverse(matrix[3:, 3:] - ratio @ matrix[:3, 3:]) @ (rhs[3:] - ratio @ rhs[:3])
+    return jnp.concatenate([inverse @ (rhs[:3] - matrix[:3, 3:] @ lower), lower])
 
 
 def _inverse(matrix: jax.Array) -> jax.Array:

@@ -33,10 +33,10 @@ def supports(model: mjx.Model, data: mjx.Data) -> bool:
 
     ``nl`` counts the rows of limits, which a flag may disable, also those of balls and tendons.
     """
-    fields = jax_fields(data)
+    impl = jax_fields(data)
     joints = _limited_joints(model)
-    only_limits = fields.efc_J.shape[0] == fields.nl == joints.size
-    return only_limits and max(map(len, _coupled_rows(model, joints))) <= _MAX_ROWS_TOGETHER
+    has_only_limits = impl.efc_J.shape[0] == impl.nl == joints.size
+    return has_only_limits and max(map(len, _coupled_rows(model, joints))) <= _MAX_ROWS_TOGETHER
 
 
 def past_limit(model: mjx.Model, data: mjx.Data) -> jax.Array:
@@ -61,11 +61,11 @@ def solve_limits(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array
       The acceleration [nv], the limits' joint forces [nv] and the rows' forces [rows].
     """
     # The rows are made again here, so that nothing outside this branch needs them.
-    fields = jax_fields(impedance.make_constraint(model, data))
+    impl = jax_fields(impedance.make_constraint(model, data))
     joints = _limited_joints(model)
     dofs = np.asarray(model.jnt_dofadr)[joints]
     # A row's only entry: 1 at the lower limit, -1 at the upper one, 0 inside.
-    sign = [fields.efc_J[i, dof] for i, dof in enumerate(dofs)]
+    sign = [impl.efc_J[i, dof] for i, dof in enumerate(dofs)]
     unit = jnp.eye(model.nv, dtype=data.qacc_smooth.dtype)
     # response[i] is inv(M) applied to row i, up to its sign.
     response = [inertia.inverse_times(model, data, unit[dof]) for dof in dofs]
@@ -73,11 +73,10 @@ def solve_limits(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array
     for rows in _coupled_rows(model, joints):
         # D A and -D b of the module's docstring: f = max(0, target - matrix f).
         matrix = [
-            [fields.efc_D[i] * sign[i] * sign[j] * response[i][dofs[j]] for j in rows] for i in rows
+            [impl.efc_D[i] * sign[i] * sign[j] * response[i][dofs[j]] for j in rows] for i in rows
         ]
         target = [
-            fields.efc_D[i] * (fields.efc_aref[i] - sign[i] * data.qacc_smooth[dofs[i]])
-            for i in rows
+            impl.efc_D[i] * (impl.efc_aref[i] - sign[i] * data.qacc_smooth[dofs[i]]) for i in rows
         ]
         for i, value in zip(rows, _complementary(matrix, target), strict=True):
             force[i] = value
@@ -89,8 +88,8 @@ def solve_limits(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array
 
 def _limited_joints(model: mjx.Model) -> np.ndarray:
     """Returns the limited slide and hinge joints, in the order of their rows."""
-    scalar = np.isin(model.jnt_type, (mjx.JointType.SLIDE, mjx.JointType.HINGE))
-    return np.flatnonzero(scalar & (np.asarray(model.jnt_limited) != 0))
+    is_scalar = np.isin(model.jnt_type, (mjx.JointType.SLIDE, mjx.JointType.HINGE))
+    return np.flatnonzero(is_scalar & (np.asarray(model.jnt_limited) != 0))
 
 
 def _coupled_rows(model: mjx.Model, joints: np.ndarray) -> list[list[int]]:
@@ -105,19 +104,19 @@ def _complementary(matrix: list[list[Any]], target: list[Any]) -> list[Any]:
     Each set of active rows gives one candidate; the one that is consistent is taken.
     """
     # With one row active, which is then as if it were alone, the other's force must be zero.
-    single = [jnp.maximum(target[i], 0) / (1 + matrix[i][i]) for i in range(len(target))]
+    forces1 = [jnp.maximum(target[i], 0) / (1 + matrix[i][i]) for i in range(len(target))]
     if len(target) == 1:
-        return single
+        return forces1
     (a, b), (c, d) = matrix
-    first_suffices = target[1] - c * single[0] <= 0
-    second_suffices = target[0] - b * single[1] <= 0
+    is_first = target[1] - c * forces1[0] <= 0
+    is_second = target[0] - b * forces1[1] <= 0
     # With both active they solve f + matrix f = target, by Cramer's rule.
     determinant = (1 + a) * (1 + d) - b * c
-    pair = [
+    forces2 = [
         ((1 + d) * target[0] - b * target[1]) / determinant,
         ((1 + a) * target[1] - c * target[0]) / determinant,
     ]
     return [
-        jnp.where(first_suffices, single[0], jnp.where(second_suffices, 0, pair[0])),
-        jnp.where(first_suffices, 0, jnp.where(second_suffices, single[1], pair[1])),
+        jnp.where(is_first, forces1[0], jnp.where(is_second, 0, forces2[0])),
+        jnp.where(is_first, 0, jnp.where(is_second, forces1[1], forces2[1])),
     ]

@@ -72,8 +72,8 @@ def check_lookup(function: Callable[..., Any], name: str) -> None:
     """
     # The code of functions that it defines is among its constants.
     code = inspect.unwrap(function).__code__
-    nested = [const for const in code.co_consts if isinstance(const, types.CodeType)]
-    if not any(name in function_code.co_names for function_code in (code, *nested)):
+    nested_codes = [const for const in code.co_consts if isinstance(const, types.CodeType)]
+    if not any(name in function_code.co_names for function_code in (code, *nested_codes)):
         versions = " and ".join(f"{package}=={tag}.*" for package, tag in TESTED_VERSIONS.items())
         raise RuntimeError(
             f"{function.__module__}.{function.__name__} does not look up {name}, which "
@@ -112,27 +112,27 @@ def wrap_points(
       elements: [W] all of ``model.wrap_type`` that are geoms.
     """
     # A geom is between two sites in ``wrap_objid``; ``wrap_prm`` is its side site, -1 if none.
-    fields: Any = model._impl
+    impl: Any = model._impl
     site1, geom, site2 = model.wrap_objid[elements + np.array([[-1], [0], [1]])]
     side = np.round(model.wrap_prm[elements]).astype(int)
     is_sphere = model.wrap_type[elements] == mjx.WrapType.SPHERE
-    ends = data.site_xpos[site1], data.site_xpos[site2]
+    end_points = data.site_xpos[site1], data.site_xpos[site2]
     geoms = data.geom_xpos[geom], data.geom_xmat[geom], model.geom_size[geom, 0]
-    arguments = *ends, *geoms, data.site_xpos[side], side[:, None] >= 0, is_sphere
-    search = fields.wrap_inside_maxiter, fields.wrap_inside_tolerance
+    arguments = *end_points, *geoms, data.site_xpos[side], side[:, None] >= 0, is_sphere
+    search = impl.wrap_inside_maxiter, impl.wrap_inside_tolerance
     # ``support.wrap`` asks in Python whether a tendon wraps inside, so that both kinds are computed
     # apart, and then put back in their order.
     order = []
-    wraps = []
-    for inside in (False, True):
-        indices = np.flatnonzero(fields.is_wrap_inside == inside)
+    paths = []
+    for is_inside in (False, True):
+        indices = np.flatnonzero(impl.is_wrap_inside == is_inside)
         if indices.size:
-            static = inside, *search, fields.wrap_inside_z_init
-            wrap = jax.vmap(lambda *x, static=static: support.wrap(*x, *static))
-            wraps.append(wrap(*(x[indices] for x in arguments)))
+            static_args = is_inside, *search, impl.wrap_inside_z_init
+            wrap = jax.vmap(lambda *x, static_args=static_args: support.wrap(*x, *static_args))
+            paths.append(wrap(*(x[indices] for x in arguments)))
             order.append(indices)
     inverse = np.argsort(np.concatenate(order))
-    length, point1, point2 = (jnp.concatenate(x)[inverse] for x in zip(*wraps, strict=True))
+    length, point1, point2 = (jnp.concatenate(x)[inverse] for x in zip(*paths, strict=True))
     # A tendon that misses its geom has a length of -1 on it.
     return length.reshape(-1) >= 0, point1, point2
 
@@ -152,8 +152,8 @@ def collision_with(
       functions: from MJX's table, a ``collider`` for each pair of types of geoms in MJX's order,
         makes the copy's.
     """
-    table = functions(dict(collision_driver._COLLISION_FUNC))
-    return _copy(mjx.collision, _COLLISION_FUNC=table)
+    colliders = functions(dict(collision_driver._COLLISION_FUNC))
+    return _copy(mjx.collision, _COLLISION_FUNC=colliders)
 
 
 def rows_with(kbi: Callable[..., Any]) -> Callable[[mjx.Model, mjx.Data], mjx.Data]:
@@ -168,8 +168,8 @@ def rows_with(kbi: Callable[..., Any]) -> Callable[[mjx.Model, mjx.Data], mjx.Da
 def _copy(function: Callable[..., Any], **meanings: Any) -> Callable[..., Any]:
     """Returns a copy of a function of MJX in which global names have other meanings."""
     # Without MJX's decorators, which call the original.
-    plain = inspect.unwrap(function)
-    return types.FunctionType(plain.__code__, {**plain.__globals__, **meanings})
+    original = inspect.unwrap(function)
+    return types.FunctionType(original.__code__, {**original.__globals__, **meanings})
 
 
 def data_with(functions: Callable[[_Colliders], _Colliders]) -> Callable[..., mjx.Data]:
@@ -182,8 +182,8 @@ def data_with(functions: Callable[[_Colliders], _Colliders]) -> Callable[..., mj
       (model, device) -> data
     """
     # MJX's function asks ``collision_driver`` for dimensions; the copy asks this stand-in.
-    table = functions(dict(collision_driver._COLLISION_FUNC))
-    make_condim = _copy(collision_driver.make_condim, _COLLISION_FUNC=table)
+    colliders = functions(dict(collision_driver._COLLISION_FUNC))
+    make_condim = _copy(collision_driver.make_condim, _COLLISION_FUNC=colliders)
     driver = types.SimpleNamespace(make_condim=make_condim)
     return _copy(io._make_data_jax, collision_driver=driver)
 

@@ -36,7 +36,7 @@ from mjx_reinforce.engine.physics.mjx_internals import jax_fields
 from mjx_reinforce.engine.scalar import skippable
 
 #: An interval is narrow if its lower end is at least this share of its upper end.
-_NARROW = 0.999
+_NARROW_RATIO = 0.999
 #: From the unconstrained acceleration the optimum may be more steps away than from a warm start.
 _STEPS_FROM_COLD = 50
 # mjMINVAL: what C takes for zero.
@@ -49,7 +49,7 @@ class Rows(NamedTuple):
     jacobian: J, ``efc_J``
     reference: [rows] r, ``efc_aref``
     constraint_mass: [rows] D, ``efc_D``
-    both_sides: [rows] whether a row is active on both sides
+    is_two_sided: [rows] whether a row is active on both sides
     loss: [rows of equality and friction loss, which come first] the most that each pushes, inf for
       equality; None if no row has friction loss
     """
@@ -57,14 +57,14 @@ class Rows(NamedTuple):
     jacobian: Any
     reference: jax.Array
     constraint_mass: jax.Array
-    both_sides: jax.Array
+    is_two_sided: jax.Array
     loss: jax.Array | None = None
 
     def active(self, residual: jax.Array) -> jax.Array:
         """Returns which rows push as springs at residuals [rows]; a NaN does, not to be lost."""
-        pushes = self.both_sides | ~(residual >= 0)
+        is_pushing = self.is_two_sided | ~(residual >= 0)
         # A row that slides has a linear cost: it adds to the gradient alone, not to the Hessian.
-        return pushes if self.loss is None else pushes & (self.sliding(residual) == 0)
+        return is_pushing if self.loss is None else is_pushing & (self.sliding(residual) == 0)
 
     def force(self, residual: jax.Array) -> jax.Array:
         """Returns the rows' forces, [rows]."""
@@ -75,9 +75,9 @@ class Rows(NamedTuple):
         """Returns the forces [rows] of the rows that slide, 0 for others."""
         assert self.loss is not None
         # Rows of equality are among these, with an infinite loss: they never slide.
-        lossy = slice(self.loss.size)
-        slides = jnp.abs(self.constraint_mass[lossy] * residual[lossy]) >= self.loss
-        force = jnp.where(slides, -jnp.sign(residual[lossy]) * self.loss, 0)
+        loss_rows = slice(self.loss.size)
+        is_sliding = jnp.abs(self.constraint_mass[loss_rows] * residual[loss_rows]) >= self.loss
+        force = jnp.where(is_sliding, -jnp.sign(residual[loss_rows]) * self.loss, 0)
         return jnp.pad(force, (0, residual.size - self.loss.size))
 
     def cost(self, residual: jax.Array) -> jax.Array:
@@ -87,17 +87,17 @@ class Rows(NamedTuple):
             return cost
         # The linear branch of Huber's function (``frictionCost`` of C's solver), doubled; the
         # quadratic one is zero there, since a row that slides is not active.
-        lossy = slice(self.loss.size)
-        beyond = 2 * jnp.abs(residual[lossy]) - self.loss / self.constraint_mass[lossy]
-        slides = self.sliding(residual)[lossy] != 0
-        return cost.at[lossy].add(jnp.where(slides, self.loss * beyond, 0))
+        loss_rows = slice(self.loss.size)
+        excess = 2 * jnp.abs(residual[loss_rows]) - self.loss / self.constraint_mass[loss_rows]
+        is_sliding = self.sliding(residual)[loss_rows] != 0
+        return cost.at[loss_rows].add(jnp.where(is_sliding, self.loss * excess, 0))
 
-    def alike(self, new: jax.Array, old: jax.Array) -> jax.Array:
+    def alike(self, residual1: jax.Array, residual2: jax.Array) -> jax.Array:
         """Returns of each row whether its cost is the same quadratic function at two residuals."""
-        is_alike = self.active(new) == self.active(old)
+        is_alike = self.active(residual1) == self.active(residual2)
         if self.loss is not None:
             # A row may slide either way; both ways are inactive.
-            is_alike &= self.sliding(new) == self.sliding(old)
+            is_alike &= self.sliding(residual1) == self.sliding(residual2)
         return is_alike
 
 
@@ -120,17 +120,17 @@ class Problem(NamedTuple):
     division: of the rows
     rows: the constraints
     inertia: [nv, nv]
-    touching: [C] whether a contact's rows may be other than zero
+    is_touching: [C] whether a contact's rows may be other than zero
     """
 
     division: contact_rows.Blocks
     rows: Rows
     inertia: jax.Array
-    touching: jax.Array
+    is_touching: jax.Array
 
     def along(self, direction: jax.Array) -> jax.Array:
         """Returns J direction, [rows]."""
-        return contact_rows.along(self.division, self.rows.jacobian, direction, self.touching)
+        return contact_rows.along(self.division, self.rows.jacobian, direction, self.is_touching)
 
     def solution(self, end: Point) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Returns ``qacc`` [nv], ``qfrc_constraint`` [nv] and ``efc_force`` [rows] of a point."""
@@ -147,22 +147,22 @@ class Search(NamedTuple):
 
     point: the acceleration reached, and what the next step needs of it
     steps: [] how many led there
-    converged: [] whether the last step led to the minimum
+    is_converged: [] whether the last step led to the minimum
     """
 
     point: Any
     steps: jax.Array
-    converged: jax.Array
+    is_converged: jax.Array
 
 
 class Line(NamedTuple):
     """The cost's derivative along a step, for the rows that push at one length of it.
 
-    at_zero: [] where the line is at length zero
+    intercept: [] where the line is at length zero
     rate: [] how fast it increases
     """
 
-    at_zero: jax.Array
+    intercept: jax.Array
     rate: jax.Array
 
 
@@ -174,7 +174,7 @@ class _LineSearch(NamedTuple):
     root: [] where the last line is zero
     line: of the last length
     evaluations: [] how many lengths were evaluated
-    converged: [] whether the last two lengths have the same line
+    is_converged: [] whether the last two lengths have the same line
     """
 
     low: jax.Array
@@ -182,7 +182,7 @@ class _LineSearch(NamedTuple):
     root: jax.Array
     line: Line
     evaluations: jax.Array
-    converged: jax.Array
+    is_converged: jax.Array
 
 
 def supports(model: mjx.Model) -> bool:
@@ -210,44 +210,44 @@ def solve_newton(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array
 
     def improve(search: Search) -> Search:
         """Makes one step of ``mj_solPrimal``: the direction, its length, and the new point."""
-        before = search.point
-        direction, gradient = newton_direction(problem, before)
+        old_point = search.point
+        direction, gradient = newton_direction(problem, old_point)
         decrement = -jnp.dot(gradient, direction) / 2
         # A step changes imbalance and residual linearly: the line search and the new point need no
         # products with M and J but these (Mv and Jv of ``PrimalSearch``).
         change = problem.along(direction)
         change_of_imbalance = inertia @ direction
-        without_rows = Line(
-            jnp.dot(direction, before.imbalance), jnp.dot(direction, change_of_imbalance)
+        smooth_line = Line(
+            jnp.dot(direction, old_point.imbalance), jnp.dot(direction, change_of_imbalance)
         )
-        length = _line_search(rows, before, change, without_rows, model.opt.ls_iterations)
-        after = Point(
-            before.qacc + length * direction,
-            before.imbalance + length * change_of_imbalance,
-            before.residual + length * change,
+        length = _line_search(rows, old_point, change, smooth_line, model.opt.ls_iterations)
+        new_point = Point(
+            old_point.qacc + length * direction,
+            old_point.imbalance + length * change_of_imbalance,
+            old_point.residual + length * change,
         )
         # With the same rows in the same states the cost is one quadratic function at both ends, of
         # which this was the full Newton step: another would change nothing.
-        unchanged = jnp.all(rows.alike(after.residual, before.residual))
-        converged = unchanged | (decrement < min_decrement)
-        return Search(after, search.steps + 1, converged)
+        has_same_rows = jnp.all(rows.alike(new_point.residual, old_point.residual))
+        is_converged = has_same_rows | (decrement < min_decrement)
+        return Search(new_point, search.steps + 1, is_converged)
 
     return problem.solution(descend(model.opt.iterations, improve, start(model, data, problem)))
 
 
 def problem_of(model: mjx.Model, data: mjx.Data) -> Problem:
     """Returns the problem of data with its constraint rows made."""
-    fields = jax_fields(data)
+    impl = jax_fields(data)
     # MuJoCo's order of rows: ne of equalities, nf of friction loss, nl of limits, then contacts.
-    num_contact_free = fields.ne + fields.nf + fields.nl
+    num_contact_free = impl.ne + impl.nf + impl.nl
     couplings = contact_rows.couplings(model)
-    division = contact_rows.blocks(num_contact_free, fields.contact.dim, couplings)
+    division = contact_rows.blocks(num_contact_free, impl.contact.dim, couplings)
     # A NaN counts as touching, so that it gets to the acceleration.
-    touching = ~(fields.contact.dist - fields.contact.includemargin >= 0)
-    jacobian = contact_rows.with_bases(division, fields.efc_J, touching)
-    both_sides, loss = _kinds(data)
-    rows = Rows(jacobian, fields.efc_aref, fields.efc_D, both_sides, loss)
-    return Problem(division, rows, mjx.full_m(model, data), touching)
+    is_touching = ~(impl.contact.dist - impl.contact.includemargin >= 0)
+    jacobian = contact_rows.with_bases(division, impl.efc_J, is_touching)
+    is_two_sided, loss = _kinds(data)
+    rows = Rows(jacobian, impl.efc_aref, impl.efc_D, is_two_sided, loss)
+    return Problem(division, rows, mjx.full_m(model, data), is_touching)
 
 
 def start(model: mjx.Model, data: mjx.Data, problem: Problem) -> Point:
@@ -268,18 +268,18 @@ def start(model: mjx.Model, data: mjx.Data, problem: Problem) -> Point:
 
 def _kinds(data: mjx.Data) -> tuple[jax.Array, jax.Array | None]:
     """Returns which rows [rows] are active on both sides, and ``Rows.loss``."""
-    fields = jax_fields(data)
-    num_two_sided = fields.ne + fields.nf
+    impl = jax_fields(data)
+    num_two_sided = impl.ne + impl.nf
     loss = None
-    if fields.nf:
-        loss = fields.efc_frictionloss[:num_two_sided].at[: fields.ne].set(jnp.inf)
-    return jnp.arange(fields.efc_D.size) < num_two_sided, loss
+    if impl.nf:
+        loss = impl.efc_frictionloss[:num_two_sided].at[: impl.ne].set(jnp.inf)
+    return jnp.arange(impl.efc_D.size) < num_two_sided, loss
 
 
 def descend(max_steps: int, improve: Callable[[Search], Search], start: Any) -> Any:
     """Returns the point that Newton's method reaches from a start in so many steps."""
     return jax.lax.while_loop(
-        lambda search: ~search.converged & (search.steps < max_steps),
+        lambda search: ~search.is_converged & (search.steps < max_steps),
         improve,
         Search(start, jnp.int32(0), jnp.array(False)),
     ).point
@@ -316,7 +316,7 @@ def newton_direction(problem: Problem, point: Point) -> tuple[jax.Array, jax.Arr
 
 
 def _line_search(
-    rows: Rows, point: Point, change: jax.Array, without_rows: Line, max_rounds: int
+    rows: Rows, point: Point, change: jax.Array, smooth_line: Line, max_rounds: int
 ) -> jax.Array:
     """Returns the length of the step that leads to the least cost, [].
 
@@ -324,7 +324,7 @@ def _line_search(
       rows: the constraints.
       point: where the step starts.
       change: [rows] how the residual changes along it.
-      without_rows: the derivative along it that has no rows.
+      smooth_line: the derivative along it that has no rows.
       max_rounds: lengths to evaluate at most.
     """
     # Of each row once, for all lengths: what changes with the length is which rows count. C keeps
@@ -334,16 +334,16 @@ def _line_search(
 
     def line(active: jax.Array, residual: jax.Array) -> Line:
         """Returns the line of the rows in their states at a residual [rows]."""
-        at_zero = without_rows.at_zero + jnp.sum(jnp.where(active, row_slope, 0))
+        intercept = smooth_line.intercept + jnp.sum(jnp.where(active, row_slope, 0))
         if rows.loss is not None:  # a row that slides adds the same slope at every length
-            at_zero -= jnp.dot(rows.sliding(residual), change)
-        return Line(at_zero, without_rows.rate + jnp.sum(jnp.where(active, row_curvature, 0)))
+            intercept -= jnp.dot(rows.sliding(residual), change)
+        return Line(intercept, smooth_line.rate + jnp.sum(jnp.where(active, row_curvature, 0)))
 
     def line_at(length: jax.Array) -> Line:
         """Returns the line at a length []."""
         residual = point.residual + length * change
-        pushes = rows.both_sides | (residual < 0)
-        return line(pushes if rows.loss is None else rows.active(residual), residual)
+        is_pushing = rows.is_two_sided | (residual < 0)
+        return line(is_pushing if rows.loss is None else rows.active(residual), residual)
 
     return root(line(rows.active(point.residual), point.residual), line_at, max_rounds)
 
@@ -364,13 +364,13 @@ def root(start_line: Line, line_at: Callable[[jax.Array], Line], max_rounds: int
 
     def evaluate(search: _LineSearch) -> _LineSearch:
         """Evaluates one length, and takes the part of the interval that holds the root."""
-        outside = (search.root <= search.low) | (search.root >= search.high)
-        length = jnp.where(outside, (search.low + search.high) / 2, search.root)
-        wide = search.low < _NARROW * search.high
+        is_out = (search.root <= search.low) | (search.root >= search.high)
+        length = jnp.where(is_out, (search.low + search.high) / 2, search.root)
+        is_wide = search.low < _NARROW_RATIO * search.high
         line = line_at(length)
         # A line that does not increase has no root: the direction is zero, or there is a NaN.
-        root = jnp.where(line.rate > 0, -line.at_zero / line.rate, length)
-        moved = [(new < old) | (new > old) for new, old in zip(line, search.line, strict=True)]
+        root = jnp.where(line.rate > 0, -line.intercept / line.rate, length)
+        moves = [(x < y) | (x > y) for x, y in zip(line, search.line, strict=True)]
         return _LineSearch(
             # The derivative increases: where the line's root is ahead it is negative at the length.
             low=jnp.where(root > length, length, search.low),
@@ -379,7 +379,7 @@ def root(start_line: Line, line_at: Callable[[jax.Array], Line], max_rounds: int
             line=line,
             evaluations=search.evaluations + 1,
             # In the middle of a wide interval, the last line's root may not be the derivative's.
-            converged=~((outside & wide) | jnp.any(jnp.stack(moved))),  # a NaN does not move
+            is_converged=~((is_out & is_wide) | jnp.any(jnp.stack(moves))),  # a NaN does not move
         )
 
     start = _LineSearch(
@@ -388,10 +388,10 @@ def root(start_line: Line, line_at: Callable[[jax.Array], Line], max_rounds: int
         root=jnp.ones_like(start_line.rate),  # a full Newton step
         line=start_line,
         evaluations=jnp.int32(0),
-        converged=jnp.array(False),
+        is_converged=jnp.array(False),
     )
     return jax.lax.while_loop(
-        lambda search: ~search.converged & (search.evaluations < max_rounds), evaluate, start
+        lambda search: ~search.is_converged & (search.evaluations < max_rounds), evaluate, start
     ).root
 
 
@@ -406,8 +406,8 @@ def solve_in_loops(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Arr
         qacc, imbalance = search.point
         direction, decrement, residuals = _direction_in_loops(groups, inertia, *search.point)
         change_of_imbalance = inertia @ direction
-        without_rows = Line(jnp.dot(direction, imbalance), jnp.dot(direction, change_of_imbalance))
-        _, changes = _fold(lambda _, rows: (None, rows.jacobian @ direction), None, groups)
+        smooth_line = Line(jnp.dot(direction, imbalance), jnp.dot(direction, change_of_imbalance))
+        _, residual_changes = _fold(lambda _, rows: (None, rows.jacobian @ direction), None, groups)
 
         def line_at(length: jax.Array) -> Line:
             """Returns the line at a length []."""
@@ -416,23 +416,23 @@ def solve_in_loops(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Arr
                 """Adds to the line what the rows of one contact have."""
                 rows, residual, change = contact
                 active = rows.active(residual + length * change)
-                weighted = jnp.where(active, rows.constraint_mass * change, 0)
-                at_zero = line.at_zero + jnp.dot(weighted, residual)
+                weighted_change = jnp.where(active, rows.constraint_mass * change, 0)
+                intercept = line.intercept + jnp.dot(weighted_change, residual)
                 if rows.loss is not None:
-                    at_zero -= jnp.dot(rows.sliding(residual + length * change), change)
-                return Line(at_zero, line.rate + jnp.dot(weighted, change)), None
+                    intercept -= jnp.dot(rows.sliding(residual + length * change), change)
+                return Line(intercept, line.rate + jnp.dot(weighted_change, change)), None
 
-            return _fold(add_contact, without_rows, groups, residuals, changes)[0]
+            return _fold(add_contact, smooth_line, groups, residuals, residual_changes)[0]
 
         length = root(line_at(jnp.zeros_like(decrement)), line_at, model.opt.ls_iterations)
 
-        def compare(unchanged: jax.Array, contact: tuple) -> tuple[jax.Array, None]:
+        def compare(has_same_rows: jax.Array, contact: tuple) -> tuple[jax.Array, None]:
             rows, residual, change = contact
-            return unchanged & jnp.all(rows.alike(residual + length * change, residual)), None
+            return has_same_rows & jnp.all(rows.alike(residual + length * change, residual)), None
 
-        unchanged, _ = _fold(compare, jnp.array(True), groups, residuals, changes)
-        after = qacc + length * direction, imbalance + length * change_of_imbalance
-        return Search(after, search.steps + 1, unchanged | (decrement < min_decrement))
+        has_same_rows, _ = _fold(compare, jnp.array(True), groups, residuals, residual_changes)
+        new_point = qacc + length * direction, imbalance + length * change_of_imbalance
+        return Search(new_point, search.steps + 1, has_same_rows | (decrement < min_decrement))
 
     # At the unconstrained acceleration the imbalance M a - qfrc_smooth is zero.
     start = data.qacc_smooth, jnp.zeros_like(data.qacc_smooth)
@@ -453,12 +453,12 @@ def _rows_by_contact(model: mjx.Model, data: mjx.Data) -> list[Rows]:
 
     The arrays are [contacts, rows of a contact, ...]; the rows of no contact are as if of one.
     """
-    fields = jax_fields(data)
-    num_contact_free = fields.ne + fields.nf + fields.nl
+    impl = jax_fields(data)
+    num_contact_free = impl.ne + impl.nf + impl.nl
     couplings = contact_rows.couplings(model)
-    division = contact_rows.blocks(num_contact_free, fields.contact.dim, couplings)
-    both_sides, loss = _kinds(data)
-    rows = fields.efc_J, fields.efc_aref, fields.efc_D, both_sides
+    division = contact_rows.blocks(num_contact_free, impl.contact.dim, couplings)
+    is_two_sided, loss = _kinds(data)
+    rows = impl.efc_J, impl.efc_aref, impl.efc_D, is_two_sided
     groups = zip(*(contact_rows.by_group(division, x) for x in rows), strict=True)
     if loss is not None:  # of equalities and friction loss, never of a contact's rows
         loss = loss[None]
@@ -502,11 +502,11 @@ def _direction_in_loops(
         def add_rows() -> tuple:
             """Returns the Hessian + J' D J, and the gradient - J' f."""
             hessian, gradient = sums
-            weighted = rows.jacobian.T * active_mass
-            slope = gradient + weighted @ residual
+            weighted_jacobian = rows.jacobian.T * active_mass
+            slope = gradient + weighted_jacobian @ residual
             if rows.loss is not None:
                 slope -= rows.jacobian.T @ rows.sliding(residual)
-            return hessian + weighted @ rows.jacobian, slope
+            return hessian + weighted_jacobian @ rows.jacobian, slope
 
         if rows.loss is not None:  # all rows may slide
             return add_rows(), residual
@@ -517,8 +517,8 @@ def _direction_in_loops(
     return direction, -jnp.dot(gradient, direction) / 2, residuals
 
 
-def _inverse_times(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """Returns inv(matrix) right, [nv], for a positive definite matrix [nv, nv].
+def _inverse_times(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
+    """Returns inv(matrix) rhs, [nv], for a positive definite matrix [nv, nv].
 
     Each round eliminates the first of the unknowns that are left, and moves the others up by one
     place, so that all rounds are the same code.
@@ -526,20 +526,20 @@ def _inverse_times(matrix: jax.Array, right: jax.Array) -> jax.Array:
 
     def eliminate(system: tuple, _: None) -> tuple[tuple, tuple]:
         """Eliminates the first unknown; returns the smaller system, padded, and its equation."""
-        matrix, right = system
+        matrix, rhs = system
         column = matrix[:, 0]
         inverse = 1 / matrix[0, 0]
         factors = column * inverse
         matrix = matrix - factors[:, None] * column
-        remainder = right - factors * right[0]
+        remainder = rhs - factors * rhs[0]
         # The zeros that move in at the end are of unknowns that are already eliminated.
         smaller_system = jnp.pad(matrix[1:, 1:], (0, 1)), jnp.pad(remainder[1:], (0, 1))
-        return smaller_system, (factors[1:], right[0] * inverse)
+        return smaller_system, (factors[1:], rhs[0] * inverse)
 
     def substitute(solution: jax.Array, equation: tuple) -> tuple[jax.Array, None]:
         factors, value = equation
         return jnp.append(value - jnp.dot(factors, solution[:-1]), solution[:-1]), None
 
     # The last unknown first; each one moves those after it down by a place.
-    _, equations = lax.scan(eliminate, (matrix, right), None, len(right))
-    return lax.scan(substitute, jnp.zeros_like(right), equations, reverse=True)[0]
+    _, equations = lax.scan(eliminate, (matrix, rhs), None, len(rhs))
+    return lax.scan(substitute, jnp.zeros_like(rhs), equations, reverse=True)[0]

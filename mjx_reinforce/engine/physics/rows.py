@@ -65,8 +65,8 @@ def _with_changes(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
     def speed(qpos: jax.Array) -> jax.Array:
         """Returns J(qpos) qvel [rows] of the connects and welds, at the velocity of the data."""
-        moved = mjx.com_pos(model, mjx.kinematics(model, no_contact.replace(qpos=qpos)))
-        return jax_fields(make_rows(model, moved)).efc_J[:num_rows] @ data.qvel
+        moved_data = mjx.com_pos(model, mjx.kinematics(model, no_contact.replace(qpos=qpos)))
+        return jax_fields(make_rows(model, moved_data)).efc_J[:num_rows] @ data.qvel
 
     # The acceleration of a row is J qacc + dJ/dt qvel. The second is known before the solver, which
     # sees J qacc alone: it moves to ``efc_aref``.
@@ -88,9 +88,9 @@ def _rate(model: mjx.Model, data: mjx.Data) -> jax.Array:
             qposadr += 3
             dofadr += 3
         # q' = q w / 2, with the angular velocity w in the body's frame.
-        turning = data.qvel[dofadr : dofadr + 3]
+        angular_velocity = data.qvel[dofadr : dofadr + 3]
         quaternion = data.qpos[qposadr : qposadr + 4]
-        rates.append(mjx_internals.quat_mul_axis(quaternion, turning) / 2)
+        rates.append(mjx_internals.quat_mul_axis(quaternion, angular_velocity) / 2)
     return jnp.concatenate(rates)
 
 
@@ -104,8 +104,8 @@ def _contact_rows(model: mjx.Model, data: mjx.Data, dim: int, indices: np.ndarra
         """Makes the rows of one contact, zeros if it does not touch."""
 
         def touching() -> list[jax.Array]:
-            single = jax.tree.map(lambda x: x[None], contact)
-            return rows_of(make_rows(contacts_only, with_contact(data, single, np.array([dim]))))
+            batch = jax.tree.map(lambda x: x[None], contact)
+            return rows_of(make_rows(contacts_only, with_contact(data, batch, np.array([dim]))))
 
         shapes = jax.eval_shape(touching)
         return None, lax.cond(

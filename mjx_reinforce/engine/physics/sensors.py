@@ -17,45 +17,45 @@ from mjx_reinforce.engine.physics.mjx_internals import jax_fields, with_contact,
 
 _NO_EQUALITY = mjx.DisableBit.EQUALITY | mjx.DisableBit.CONSTRAINT
 _NO_CONTACT = mjx.DisableBit.CONTACT | mjx.DisableBit.CONSTRAINT
-_OF_CONTACTS = mjx.SensorType.TOUCH, mjx.SensorType.CONTACT
-_OF_FRAMES = mjx.SensorType.FRAMELINACC, mjx.SensorType.FRAMEANGACC
+_CONTACT_TYPES = mjx.SensorType.TOUCH, mjx.SensorType.CONTACT
+_FRAME_TYPES = mjx.SensorType.FRAMELINACC, mjx.SensorType.FRAMEANGACC
 #: What shows forces on bodies, or what follows from them.
-_OF_BODIES = (
+_BODY_TYPES = (
     mjx.SensorType.ACCELEROMETER,
     mjx.SensorType.FORCE,
     mjx.SensorType.TORQUE,
-    *_OF_FRAMES,
+    *_FRAME_TYPES,
 )
 #: A type that no sensor has.
 _NO_TYPE = -1
-_FOR_SENSORS = "cacc", "cfrc_int", "cfrc_ext", "subtree_linvel", "subtree_angmom"
+_SENSOR_FIELDS = "cacc", "cfrc_int", "cfrc_ext", "subtree_linvel", "subtree_angmom"
 #: What is computed only for sensors.
 Readings: TypeAlias = dict[str, Any]
 
 
 def rne_postconstraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Computes cfrc_ext, cfrc_int and cacc, as ``mj_rnePostConstraint``."""
-    model, existing = _existing(model, data)
-    return _like(mjx.rne_postconstraint(model, _with_tendons(model, existing)), data)
+    model, reduced_data = _existing(model, data)
+    return _like(mjx.rne_postconstraint(model, _with_tendons(model, reduced_data)), data)
 
 
 def sensor_acc(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Computes the sensors of forces and accelerations, as ``mj_sensorAcc``."""
-    model, existing = _existing(model, data)
+    model, reduced_data = _existing(model, data)
     # These read ``cacc`` and ``cfrc_int``, for which MJX calls its ``rne_postconstraint``.
-    if np.isin(model.sensor_type, _OF_BODIES).any():
-        existing = _with_tendons(model, existing)
+    if np.isin(model.sensor_type, _BODY_TYPES).any():
+        reduced_data = _with_tendons(model, reduced_data)
     # MJX fails on sensors of contacts where there can be none; left out, they show zero.
-    if not jax_fields(existing).contact.dim.size:
-        is_contact = np.isin(model.sensor_type, _OF_CONTACTS)
+    if not jax_fields(reduced_data).contact.dim.size:
+        is_contact = np.isin(model.sensor_type, _CONTACT_TYPES)
         sensor_type = np.where(is_contact, _NO_TYPE, model.sensor_type)
         model = model.replace(sensor_type=sensor_type)
-    return _like(_cut(model, mjx.sensor_acc(model, existing)), data)
+    return _like(_cut(model, mjx.sensor_acc(model, reduced_data)), data)
 
 
 def _cut(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Returns the data with the accelerations of frames within their cutoffs."""
-    has_cutoff = np.isin(model.sensor_type, _OF_FRAMES) & (model.sensor_cutoff > 0)
+    has_cutoff = np.isin(model.sensor_type, _FRAME_TYPES) & (model.sensor_cutoff > 0)
     if not has_cutoff.any():
         return data
     # A sensor has ``sensor_dim`` entries one after the other, and one cutoff for all.
@@ -67,7 +67,7 @@ def readings(model: mjx.Model, data: mjx.Data) -> Readings:
     """Returns what is computed only for sensors; nothing if the model has none."""
     if not model.nsensor:
         return {}
-    fields = {name: getattr(jax_fields(data), name) for name in _FOR_SENSORS}
+    fields = {name: getattr(jax_fields(data), name) for name in _SENSOR_FIELDS}
     return {"sensordata": data.sensordata, "fields": fields}
 
 
@@ -78,12 +78,12 @@ def with_readings(data: mjx.Data, readings: Readings) -> mjx.Data:
     return with_fields(data.replace(sensordata=readings["sensordata"]), **readings["fields"])
 
 
-def _like(computed: mjx.Data, data: mjx.Data) -> mjx.Data:
+def _like(sensor_data: mjx.Data, data: mjx.Data) -> mjx.Data:
     """Returns what was computed, with the contacts and the forces that the data had."""
     # What was changed for the computation alone: a loop's carry keeps its shape, and the next step
     # its applied forces.
     contact = jax_fields(data).contact
-    return with_contact(computed.replace(xfrc_applied=data.xfrc_applied), contact, contact.dim)
+    return with_contact(sensor_data.replace(xfrc_applied=data.xfrc_applied), contact, contact.dim)
 
 
 def _existing(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Model, mjx.Data]:

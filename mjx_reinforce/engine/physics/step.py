@@ -121,12 +121,12 @@ def solve_constraints(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     Returns:
       The data with ``qacc``, ``qfrc_constraint`` and ``efc_force``.
     """
-    fields = jax_fields(data)
+    impl = jax_fields(data)
     solver = _solve_in_steps
     if limits.supports(model, data) and not early_stop.stops_early(model):
         is_active = limits.past_limit(model, data)
         solver = limits.solve_limits
-    elif fields.ne or fields.nf:  # rows that are always active
+    elif impl.ne or impl.nf:  # rows that are always active
         is_active = jnp.array(True)
     else:
         is_active = _any_active(data)
@@ -138,7 +138,7 @@ def solve_constraints(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         lambda: (
             data.qacc_smooth,
             jnp.zeros_like(data.qfrc_constraint),
-            jnp.zeros_like(fields.efc_force),
+            jnp.zeros_like(impl.efc_force),
         ),
     )
     data = data.replace(qacc=qacc, qfrc_constraint=qfrc_constraint)
@@ -150,10 +150,10 @@ def _any_active(data: mjx.Data) -> jax.Array:
 
     A NaN counts as active, so that it gets to the acceleration as it does in MJX.
     """
-    fields = jax_fields(data)
-    num_contact_free = fields.ne + fields.nf + fields.nl
-    contact_free = jnp.any(fields.efc_J[:num_contact_free] != 0)
-    return contact_free | ~jnp.all(fields.contact.dist - fields.contact.includemargin >= 0)
+    impl = jax_fields(data)
+    num_contact_free = impl.ne + impl.nf + impl.nl
+    contact_free = jnp.any(impl.efc_J[:num_contact_free] != 0)
+    return contact_free | ~jnp.all(impl.contact.dist - impl.contact.includemargin >= 0)
 
 
 def _solve_in_steps(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -202,14 +202,14 @@ def runge_kutta_4(
         # not of velocities in the stages' frames, which MJX averages.
         rate = _displacement_rate(model, stage.qvel, rate, position)
         rates = rate, stage.qacc, stage.act_dot
-        sums = tuple(total + weight * x for total, x in zip(sums, rates, strict=True))
+        sums = tuple(rate_sum + weight * x for rate_sum, x in zip(sums, rates, strict=True))
         # Every stage starts where the step did, and goes on from there at this stage's rates.
         qvel, qacc, act_dot = (next_position * x for x in rates)
-        advanced = advance(model, start.replace(qacc=qacc), act_dot, qacc, qvel)
+        next_data = advance(model, start.replace(qacc=qacc), act_dot, qacc, qvel)
         # Activations go on without their clamp to ``actrange``, which ``advance`` has.
         stage = stage.replace(
-            qpos=advanced.qpos,
-            qvel=advanced.qvel,
+            qpos=next_data.qpos,
+            qvel=next_data.qvel,
             act=start.act + act_dot * timestep,
             time=start.time + next_position * timestep,
         )
@@ -227,9 +227,9 @@ def runge_kutta_4(
     return advance(model, end, act_dot, qacc, qvel).replace(qacc=qacc)
 
 
-def like(new: mjx.Data, old: mjx.Data) -> mjx.Data:
+def like(data: mjx.Data, template: mjx.Data) -> mjx.Data:
     """Returns the new data in the types of the old; MJX makes tendon indices int64 under x64."""
-    return jax.tree.map(lambda x, y: x.astype(y.dtype), new, old)
+    return jax.tree.map(lambda x, y: x.astype(y.dtype), data, template)
 
 
 def _displacement_rate(
@@ -249,9 +249,9 @@ def _displacement_rate(
             continue
         # A free joint has three degrees of freedom of translation before those of rotation.
         start = int(dof) + (3 if joint_type == mjx.JointType.FREE else 0)
-        turning = slice(start, start + 3)
-        rotation = position * model.opt.timestep * last_rate[turning]
-        rate = rate.at[turning].set(_rotation_rate(rotation, qvel[turning]))
+        dofs = slice(start, start + 3)
+        rotation = position * model.opt.timestep * last_rate[dofs]
+        rate = rate.at[dofs].set(_rotation_rate(rotation, qvel[dofs]))
     return rate
 
 
@@ -267,17 +267,17 @@ def _rotation_rate(rotation: jax.Array, velocity: jax.Array) -> jax.Array:
     """
     # The angle in (-pi, pi]: small rotations stay as they are, to the last digit.
     square = jnp.sum(rotation**2)
-    large = square > jnp.pi**2
-    angle = jnp.sqrt(jnp.where(large, square, 1))
+    is_large = square > jnp.pi**2
+    angle = jnp.sqrt(jnp.where(is_large, square, 1))
     excess = 2 * jnp.pi * jnp.floor(angle / (2 * jnp.pi) + 0.5)
-    rotation = jnp.where(large, rotation * (1 - excess / angle), rotation)
+    rotation = jnp.where(is_large, rotation * (1 - excess / angle), rotation)
     # c is 0/0 at zero: a series there. Both are computed, and neither may be NaN.
     square = jnp.sum(rotation**2)
-    small = square < _SMALL_SQUARE
-    safe_square = jnp.where(small, 1, square)
+    is_small = square < _SMALL_SQUARE
+    safe_square = jnp.where(is_small, 1, square)
     half_angle = jnp.sqrt(safe_square) / 2
     series = sum(c * square**i for i, c in enumerate(_BORTZ_SERIES))
     closed_form = (1 - half_angle / jnp.tan(half_angle)) / safe_square
-    coefficient = jnp.where(small, series, closed_form)
-    across = jnp.cross(rotation, velocity)
-    return velocity + across / 2 + coefficient * jnp.cross(rotation, across)
+    coefficient = jnp.where(is_small, series, closed_form)
+    cross_product = jnp.cross(rotation, velocity)
+    return velocity + cross_product / 2 + coefficient * jnp.cross(rotation, cross_product)

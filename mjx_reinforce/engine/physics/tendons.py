@@ -20,20 +20,20 @@ class _Ends(NamedTuple):
     """Ends of straight pieces.
 
     body: [N] what is held there.
-    at, toward: [N, 3] the end, and the other one (m).
+    point, far_point: [N, 3] the end, and the other one (m).
     share: [N] of the tendon's force; 0 if there is no such piece.
     tendon: [N]
     """
 
     body: np.ndarray
-    at: jax.Array
-    toward: jax.Array
+    point: jax.Array
+    far_point: jax.Array
     share: jax.Array | np.ndarray
     tendon: np.ndarray
 
 
 #: How pieces' fields are put together: what is known of the model alone stays so.
-_JOIN = np.concatenate, *[jnp.concatenate] * 3, np.concatenate
+_CONCATENATES = np.concatenate, *[jnp.concatenate] * 3, np.concatenate
 
 
 def body_forces(model: mjx.Model, data: mjx.Data) -> jax.Array:
@@ -43,15 +43,15 @@ def body_forces(model: mjx.Model, data: mjx.Data) -> jax.Array:
       model: an MJX model with a spatial tendon.
       data: its data after the constraints were solved.
     """
-    columns = zip(_JOIN, zip(*_pieces(model, data), strict=True), strict=True)
-    fields: list[Any] = [join(column) for join, column in columns]
-    ends = _Ends(*fields)
+    columns = zip(_CONCATENATES, zip(*_pieces(model, data), strict=True), strict=True)
+    stacks: list[Any] = [concatenate(column) for concatenate, column in columns]
+    ends = _Ends(*stacks)
     # As ``mju_normalize3``: a piece without length points along x.
-    along = ends.at - ends.toward
-    length = jnp.linalg.norm(along, axis=1, keepdims=True)
-    along = jnp.where(length < mjMINVAL, jnp.eye(3)[0], along / jnp.maximum(length, mjMINVAL))
-    force = (_forces(model, data)[ends.tendon] * ends.share)[:, None] * along
-    torque = jnp.cross(ends.at - data.xipos[ends.body], force)
+    axis = ends.point - ends.far_point
+    length = jnp.linalg.norm(axis, axis=1, keepdims=True)
+    axis = jnp.where(length < mjMINVAL, jnp.eye(3)[0], axis / jnp.maximum(length, mjMINVAL))
+    force = (_forces(model, data)[ends.tendon] * ends.share)[:, None] * axis
+    torque = jnp.cross(ends.point - data.xipos[ends.body], force)
     wrench = jnp.concatenate([force, torque], axis=1)
     return jnp.zeros_like(data.xfrc_applied).at[ends.body].add(wrench)
 
@@ -66,8 +66,8 @@ def _pieces(model: mjx.Model, data: mjx.Data) -> list[_Ends]:
     for i in np.flatnonzero(is_pulley):
         divisor[i : np.searchsorted(tendon, tendon[i], "right")] = np.asarray(model.wrap_prm)[i]
     is_site = model.wrap_type == mjx.WrapType.SITE
-    straight = np.flatnonzero(is_site[:-1] & is_site[1:] & (tendon[:-1] == tendon[1:]))
-    wrapped = np.flatnonzero(np.isin(model.wrap_type, _GEOMS))
+    starts = np.flatnonzero(is_site[:-1] & is_site[1:] & (tendon[:-1] == tendon[1:]))
+    wraps = np.flatnonzero(np.isin(model.wrap_type, _GEOMS))
     share = 1 / np.maximum(divisor, mjMINVAL)
 
     def bodies(elements: np.ndarray) -> np.ndarray:
@@ -78,33 +78,33 @@ def _pieces(model: mjx.Model, data: mjx.Data) -> list[_Ends]:
 
     pieces = [
         _Ends(bodies(i), places(i), places(j), share[i], tendon[i])
-        for i, j in ((straight, straight + 1), (straight + 1, straight))
+        for i, j in ((starts, starts + 1), (starts + 1, starts))
     ]
-    if wrapped.size:
+    if wraps.size:
         # From each site to where the tendon meets the geom; where it misses the geom, to the site
         # on the other side. The geom's body is pulled where the tendon meets it.
-        touches, *points = mjx_internals.wrap_points(model, data, wrapped)
-        geom_body = model.geom_bodyid[model.wrap_objid[wrapped]]
+        is_wrap, *points = mjx_internals.wrap_points(model, data, wraps)
+        geom_body = model.geom_bodyid[model.wrap_objid[wraps]]
         for step, point in zip((-1, 1), points, strict=True):
-            site = wrapped + step
-            far_site = wrapped - step
-            force_share = share[wrapped]
-            of_tendon = tendon[wrapped]
-            toward = jnp.where(touches[:, None], point, places(far_site))
-            pieces.append(_Ends(bodies(site), places(site), toward, force_share, of_tendon))
-            pieces.append(_Ends(geom_body, point, places(site), touches * force_share, of_tendon))
+            site = wraps + step
+            far_site = wraps - step
+            force_share = share[wraps]
+            tendon_id = tendon[wraps]
+            far_point = jnp.where(is_wrap[:, None], point, places(far_site))
+            pieces.append(_Ends(bodies(site), places(site), far_point, force_share, tendon_id))
+            pieces.append(_Ends(geom_body, point, places(site), is_wrap * force_share, tendon_id))
     return pieces
 
 
 def _forces(model: mjx.Model, data: mjx.Data) -> jax.Array:
     """Returns the force of each tendon along its length, [ntendon] (N); if positive, it pushes."""
-    fields = jax_fields(data)
+    impl = jax_fields(data)
     # The spring is slack between the two lengths of ``tendon_lengthspring``.
-    below, above = model.tendon_lengthspring.T - data.ten_length
-    force = model.tendon_stiffness * (jnp.maximum(below, 0) + jnp.minimum(above, 0))
-    force -= model.tendon_damping * fields.ten_velocity
+    shortfall, excess = model.tendon_lengthspring.T - data.ten_length
+    force = model.tendon_stiffness * (jnp.maximum(shortfall, 0) + jnp.minimum(excess, 0))
+    force -= model.tendon_damping * impl.ten_velocity
     # The armature resists the length's second derivative, J qacc + dJ/dt qvel.
-    acceleration = fields.ten_J @ data.qacc + mjx_internals.tendon_dot(model, data) @ data.qvel
+    acceleration = impl.ten_J @ data.qacc + mjx_internals.tendon_dot(model, data) @ data.qvel
     force -= model.tendon_armature * acceleration
     actuators = np.flatnonzero(model.actuator_trntype == mjx.TrnType.TENDON)
     actuator_force = model.actuator_gear[actuators, 0] * data.actuator_force[actuators]
@@ -114,13 +114,13 @@ def _forces(model: mjx.Model, data: mjx.Data) -> jax.Array:
 
 def _with_rows(model: mjx.Model, data: mjx.Data, force: jax.Array) -> jax.Array:
     """Adds the forces of the constraint rows of tendons, the last ones of their kinds."""
-    fields = jax_fields(data)
-    efc_force = fields.efc_force
-    equality_end, friction_end, limit_end = np.cumsum([fields.ne, fields.nf, fields.nl])
+    impl = jax_fields(data)
+    efc_force = impl.efc_force
+    equality_end, friction_end, limit_end = np.cumsum([impl.ne, impl.nf, impl.nl])
     equalities = np.flatnonzero(model.eq_type == mjx.EqType.TENDON)
-    rough = np.flatnonzero(mjx_internals.has_friction(model))
-    limited = np.flatnonzero(model.tendon_limited)
-    if fields.ne and equalities.size:
+    friction = np.flatnonzero(mjx_internals.has_friction(model))
+    limits = np.flatnonzero(model.tendon_limited)
+    if impl.ne and equalities.size:
         # The length of the first tendon is a polynomial of the second's: through its slope the row
         # pulls at the second. An equality of one tendon has -1 for the second.
         pull = efc_force[equality_end - equalities.size : equality_end]
@@ -131,11 +131,11 @@ def _with_rows(model: mjx.Model, data: mjx.Data, force: jax.Array) -> jax.Array:
         slope = jnp.sum(coefficients * stretch[:, None] ** np.arange(4), axis=1)
         force = force.at[tendon1].add(pull)
         force = force.at[tendon2].add(jnp.where(tendon2 < 0, 0, -slope * pull))
-    if fields.nf and rough.size:
-        force = force.at[rough].add(efc_force[friction_end - rough.size : friction_end])
-    if fields.nl and limited.size:
+    if impl.nf and friction.size:
+        force = force.at[friction].add(efc_force[friction_end - friction.size : friction_end])
+    if impl.nl and limits.size:
         # Of both limits MJX makes the row of the nearer one, which pushes away from it.
-        below, above = (model.tendon_range.T - data.ten_length)[:, limited]
-        sign = jnp.where(-below < above, 1, -1)
-        force = force.at[limited].add(sign * efc_force[limit_end - limited.size : limit_end])
+        lower_gap, upper_gap = (model.tendon_range.T - data.ten_length)[:, limits]
+        sign = jnp.where(-lower_gap < upper_gap, 1, -1)
+        force = force.at[limits].add(sign * efc_force[limit_end - limits.size : limit_end])
     return force

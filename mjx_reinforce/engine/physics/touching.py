@@ -28,7 +28,7 @@ Solver = Callable[..., Solution]
 #: Loops over more contacts are not written out, whatever the engine.
 _UNROLLABLE = 6
 #: Of so many contacts it is asked at once whether one of them touches.
-_BATCH = 8
+_BATCH_SIZE = 8
 
 
 def solve_touching(solver: Solver, fallback: Solver, model: mjx.Model, data: mjx.Data) -> Solution:
@@ -44,8 +44,8 @@ def solve_touching(solver: Solver, fallback: Solver, model: mjx.Model, data: mjx
       data: with its constraint rows made.
     """
     contact = jax_fields(data).contact
-    by_dim = [np.flatnonzero(contact.dim == dim) for dim in (1, 3, 4, 6)]
-    kinds = [kind for kind in by_dim if kind.size]
+    contacts_by_dim = [np.flatnonzero(contact.dim == dim) for dim in (1, 3, 4, 6)]
+    kinds = [kind for kind in contacts_by_dim if kind.size]
     room = _room(model)
     num_rows = jax_fields(data).efc_D.size
     num_saved = sum(_rows_of_one(contact, kind) * max(0, kind.size - room) for kind in kinds)
@@ -73,7 +73,7 @@ def _with_few(
 ) -> Solution:
     """Solves; the kinds are the numbers of the contacts of each dimension."""
     contact = jax_fields(data).contact
-    touching = ~(contact.dist - contact.includemargin >= 0)  # a NaN counts as touching
+    is_touching = ~(contact.dist - contact.includemargin >= 0)  # a NaN counts as touching
     num_contact_rows = sum(_rows_of_one(contact, kind) * kind.size for kind in kinds)
     num_contact_free = jax_fields(data).efc_D.size - num_contact_rows
 
@@ -90,7 +90,7 @@ def _with_few(
         for kind in kinds:
             size = _rows_of_one(contact, kind)
             stop = start + size * min(kind.size, room)
-            efc_force.append(_unpack(force[start:stop].reshape(-1, size), touching[kind]))
+            efc_force.append(_unpack(force[start:stop].reshape(-1, size), is_touching[kind]))
             start = stop
         return qacc, qfrc_constraint, jnp.concatenate(efc_force)
 
@@ -103,11 +103,11 @@ def _with_few(
     counts = []
     for kind in kinds:
         contacts = jax.tree.map(lambda x, kind=kind: x[kind], contact)
-        packed, count = _pack(contacts, touching[kind], room)
-        packed_contacts.append(packed)
+        kind_contacts, count = _pack(contacts, is_touching[kind], room)
+        packed_contacts.append(kind_contacts)
         counts.append(count)
-    fits = jnp.all(jnp.stack(counts) <= room)
-    return lax.cond(fits, solve_few, solve_all)
+    has_room = jnp.all(jnp.stack(counts) <= room)
+    return lax.cond(has_room, solve_few, solve_all)
 
 
 def _rows_of_one(contact: Any, kind: np.ndarray) -> int:
@@ -115,70 +115,70 @@ def _rows_of_one(contact: Any, kind: np.ndarray) -> int:
     return max(1, 2 * (int(contact.dim[kind[0]]) - 1))
 
 
-def _pack(contacts: Any, touching: jax.Array, room: int) -> tuple[Any, jax.Array]:
+def _pack(contacts: Any, is_touching: jax.Array, room: int) -> tuple[Any, jax.Array]:
     """Brings the first contacts that touch together, in their order.
 
     Args:
       contacts: [C, ...]
-      touching: [C] which of them touch.
+      is_touching: [C] which of them touch.
       room: for how many there is room.
 
     Returns:
       Contacts [room, ...], those that do not touch in the places left, and how many touch [].
     """
-    if touching.size <= room:
+    if is_touching.size <= room:
         return contacts, jnp.int32(0)
 
     def add_contact(state: tuple, row: tuple) -> tuple[tuple, None]:
         """Puts a contact at the next place, if it touches."""
-        contact, touches = row
-        packed, count = state
+        contact, has_contact = row
+        packed_contacts, count = state
 
         def put() -> tuple:
             # Past the last place nothing is written, but the count goes on: it says what fits.
-            is_place = jnp.arange(room) == count
+            is_next_place = jnp.arange(room) == count
 
-            def put_leaf(old: jax.Array, new: jax.Array) -> jax.Array:
-                return jnp.where(is_place.reshape(-1, *[1] * new.ndim), new, old)
+            def put_leaf(packed_leaf: jax.Array, leaf: jax.Array) -> jax.Array:
+                return jnp.where(is_next_place.reshape(-1, *[1] * leaf.ndim), leaf, packed_leaf)
 
-            return jax.tree.map(put_leaf, packed, contact), count + 1
+            return jax.tree.map(put_leaf, packed_contacts, contact), count + 1
 
-        return lax.cond(touches, put, lambda: state), None
+        return lax.cond(has_contact, put, lambda: state), None
 
     def add_batch(state: tuple, batch: tuple) -> tuple[tuple, None]:
         """Puts each of a batch of contacts at its place, if one of them touches."""
-        _, touches = batch
+        _, batch_mask = batch
 
         def add_each() -> tuple:
             leaves, tree = jax.tree.flatten(batch)
-            after = state
+            next_state = state
             for row in zip(*leaves, strict=True):
-                after, _ = add_contact(after, tree.unflatten(row))
-            return after
+                next_state, _ = add_contact(next_state, tree.unflatten(row))
+            return next_state
 
-        return lax.cond(jnp.any(touches), add_each, lambda: state), None
+        return lax.cond(jnp.any(batch_mask), add_each, lambda: state), None
 
     # Places without a contact hold one at an infinite distance: its rows are zeros.
-    empty = jax.tree.map(lambda x: jnp.broadcast_to(x[0], (room, *x.shape[1:])), contacts)
-    empty = empty.replace(dist=jnp.full(room, jnp.inf, contacts.dist.dtype))
-    start = empty, jnp.int32(0)
+    empty_contacts = jax.tree.map(lambda x: jnp.broadcast_to(x[0], (room, *x.shape[1:])), contacts)
+    empty_contacts = empty_contacts.replace(dist=jnp.full(room, jnp.inf, contacts.dist.dtype))
+    start = empty_contacts, jnp.int32(0)
     # In batches, most of which one test skips; then those that fill no batch.
-    num_batched = touching.size // _BATCH * _BATCH
-    rows = contacts, touching
-    batches = jax.tree.map(lambda x: x[:num_batched].reshape(-1, _BATCH, *x.shape[1:]), rows)
+    num_batched = is_touching.size // _BATCH_SIZE * _BATCH_SIZE
+    rows = contacts, is_touching
+    batches = jax.tree.map(lambda x: x[:num_batched].reshape(-1, _BATCH_SIZE, *x.shape[1:]), rows)
     remainder = jax.tree.map(lambda x: x[num_batched:], rows)
     return lax.scan(add_contact, lax.scan(add_batch, start, batches)[0], remainder)[0]
 
 
-def _unpack(values: jax.Array, touching: jax.Array) -> jax.Array:
+def _unpack(values: jax.Array, is_touching: jax.Array) -> jax.Array:
     """Returns the values [room, ...] of contacts that touch, and 0 for the others, [C * ...]."""
-    if touching.size == len(values):
+    if is_touching.size == len(values):
         return values.reshape(-1)
 
     # The order of ``_pack``: the n-th contact that touches is at place n.
-    def read(count: jax.Array, touches: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def read(count: jax.Array, is_held: jax.Array) -> tuple[jax.Array, jax.Array]:
         return lax.cond(
-            touches, lambda: (count + 1, values[count]), lambda: (count, jnp.zeros_like(values[0]))
+            is_held, lambda: (count + 1, values[count]), lambda: (count, jnp.zeros_like(values[0]))
         )
 
-    return lax.scan(read, jnp.int32(0), touching)[1].reshape(-1)
+    return lax.scan(read, jnp.int32(0), is_touching)[1].reshape(-1)

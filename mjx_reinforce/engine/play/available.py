@@ -11,11 +11,11 @@ from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.gpu import seam as gpu
 
 #: LLVM 20, which llvmlite 0.45 has, is the first that reads the IR as it is written here.
-_OLDEST = (20,)
+_MIN_LLVM = (20,)
 #: JAX's generator whose noise it draws; ``rollout`` looks at the keys that it gets.
 GENERATOR = "threefry2x32"
 #: Settings of JAX that change numbers.
-_SETTINGS = (
+_JAX_SETTINGS = (
     "jax_default_matmul_precision",
     "jax_default_prng_impl",
     "jax_threefry_partitionable",
@@ -53,7 +53,7 @@ def known_by() -> dict[str, Any]:
         code = f"llvmlite {made_for().partition(' ')[0]}, {_short(machine.this_machine())}"
     # A GPU's numbers do not depend on the CPU beside it: such a run may move to another host.
     cpu = _host_cpu() if platform() == "cpu" else None
-    settings = {name: str(jax.config.values[name]) for name in _SETTINGS}
+    settings = {name: str(jax.config.values[name]) for name in _JAX_SETTINGS}
     return {"cpu": cpu, "machine_code": code, "jax_settings": settings}
 
 
@@ -84,7 +84,7 @@ def unavailable() -> str | None:
         import llvmlite.binding
     except (ImportError, OSError) as error:
         return f"llvmlite cannot be loaded: {error}; pip install 'llvmlite>=0.45'"
-    if llvmlite.binding.llvm_version_info < _OLDEST:
+    if llvmlite.binding.llvm_version_info < _MIN_LLVM:
         return f"llvmlite {llvmlite.__version__} is too old; pip install 'llvmlite>=0.45'"
     # The kernels write Threefry out themselves, so no other generator has the noise that ``vmap``
     # draws; nor has Threefry itself, where it is not partitionable.

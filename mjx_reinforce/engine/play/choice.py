@@ -99,14 +99,14 @@ def choose(
 
 
 def pick(
-    name: str, in_machine_code: Callable[[], Function | str], by_vmap: Function
+    name: str, native_maker: Callable[[], Function | str], vmap_function: Function
 ) -> tuple[str, str, Function]:
     """Returns an engine's name, the reason it was chosen, and what it plays with.
 
     Args:
       name: one of ``ENGINES``.
-      in_machine_code: returns what plays, or why machine code cannot.
-      by_vmap: what plays with ``vmap``.
+      native_maker: returns what plays, or why machine code cannot.
+      vmap_function: what plays with ``vmap``.
 
     Raises:
       ValueError: the name is unknown, or the engine cannot play this.
@@ -115,7 +115,7 @@ def pick(
     reason = "chosen by name"
     if name != "vmap":
         # It is compiled here, so that what LLVM refuses is a reason for ``vmap``, too.
-        function = in_machine_code()
+        function = native_maker()
         if not isinstance(function, str):
             if name == "auto":
                 reason = f"machine code for this {jax.default_backend().upper()}"
@@ -130,7 +130,7 @@ def pick(
             "(docs/troubleshooting.md)",
             stacklevel=2,
         )
-    return "vmap", reason, by_vmap
+    return "vmap", reason, vmap_function
 
 
 def _from_any_key(
@@ -176,8 +176,8 @@ def map_function(
     Raises:
       ValueError: the name is unknown, or the engine does not support the function.
     """
-    in_machine_code = functools.partial(machine_code, env, function, *examples)
-    return MapEngine(*pick(name, in_machine_code, jax.vmap(function)))
+    native_maker = functools.partial(machine_code, env, function, *examples)
+    return MapEngine(*pick(name, native_maker, jax.vmap(function)))
 
 
 def machine_code(
@@ -198,7 +198,7 @@ def machine_code(
 
 #: A policy of more parameters than about 64-64 is computed for all episodes together, by XLA: each
 #: lane of machine code would read all parameters in each step.
-_MOST_PARAMETERS = 8_000
+_MAX_PARAMETERS = 8_000
 
 
 def rollout(
@@ -282,7 +282,7 @@ def _rollout_of(engine: str, env: Environment, policy: ActingPolicy, horizon: in
     """Returns the rollout of an engine."""
     num_parameters = sum(np.size(x) for x in jax.tree.leaves(policy.actor))
     on_cpu = available.platform() == "cpu"
-    if engine == "auto" and num_parameters > _MOST_PARAMETERS and on_cpu:
+    if engine == "auto" and num_parameters > _MAX_PARAMETERS and on_cpu:
         start = base.shapes(env.reset, jax.random.key(0))
         step = machine_code(env, env.step, start, base.null_action(env))
         if not isinstance(step, str):

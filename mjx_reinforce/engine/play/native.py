@@ -78,27 +78,27 @@ def native_rollout(
     if isinstance(program.code, machine.Code):
         shapes = _result_shapes(program, horizon, num_episodes)
         num_threads = jnp.int32(threads)
-        results = cpu.call(program.code, shapes, limits, num_threads, words, *parameters, *starts)
+        outputs = cpu.call(program.code, shapes, limits, num_threads, words, *parameters, *starts)
     else:
-        results = _episodes_before_numbers(
+        outputs = _episodes_before_numbers(
             gpu.launch(program.code, program.record, horizon, limits, words, *parameters, *starts)
         )
-    observation, action, reward, length, broken, simulated = results
+    observation, action, reward, length, is_broken, simulated = outputs
     return Trajectory(
         observation=observation,
         action=action.reshape(horizon, num_episodes, *program.record[1].shape),
         reward=reward,
         mask=jnp.arange(horizon)[:, None] < length,
-        nonfinite=broken != 0,
+        nonfinite=is_broken != 0,
         simulated=simulated,
     )
 
 
 def _begin(env: Environment, program: NativeProgram, keys: jax.Array) -> tuple[Any, jax.Array]:
     """Returns the starts of episodes by their keys [N], and the keys [N] of their noise."""
-    begin_by_vmap = jax.vmap(functools.partial(episode.begin, env))
-    if isinstance(program.code, machine.Code) or program.code.facts.lanes == 1:
-        return begin_by_vmap(keys)
+    vmap_begin = jax.vmap(functools.partial(episode.begin, env))
+    if isinstance(program.code, machine.Code) or program.code.launch.lanes == 1:
+        return vmap_begin(keys)
 
     # Teams of lanes start a large model, too: in XLA's reset its sums would be atomic on a GPU, and
     # their bits would differ from run to run.
@@ -108,10 +108,10 @@ def _begin(env: Environment, program: NativeProgram, keys: jax.Array) -> tuple[A
 
     words = jax.random.key_data(keys)
     try:
-        begin_all = machine_map(begin, words[0], env=env, name=f"the start of {name_of(env)}")
+        native_begin = machine_map(begin, words[0], env=env, name=f"the start of {name_of(env)}")
     except (TooLarge, UnsupportedPrimitive, TypeError):
-        return begin_by_vmap(keys)
-    state, noise_words = begin_all(words)
+        return vmap_begin(keys)
+    state, noise_words = native_begin(words)
     return state, jax.random.wrap_key_data(noise_words)
 
 
@@ -123,11 +123,11 @@ def against_key(key: jax.Array) -> str | None:
     return f"it draws noise as {available.GENERATOR} does, and the key is of {implementation}"
 
 
-def _episodes_before_numbers(results: Sequence[jax.Array]) -> Sequence[jax.Array]:
+def _episodes_before_numbers(outputs: Sequence[jax.Array]) -> Sequence[jax.Array]:
     """Returns a kernel's results with the records' axes in the order that a CPU writes them in."""
     # Threads of a warp write the same number of neighboring episodes at once: [T, numbers, N].
-    observation, action, reward = (jnp.swapaxes(x, 1, 2) for x in results[:3])
-    return observation, action, reward[..., 0], *results[3:]
+    observation, action, reward = (jnp.swapaxes(x, 1, 2) for x in outputs[:3])
+    return observation, action, reward[..., 0], *outputs[3:]
 
 
 def unsupported(

@@ -75,28 +75,26 @@ def step_function(
     step_noise = jax.eval_shape(lambda: distribution.noise(jax.random.key(0), ()))
     words_per_step = int(np.prod(step_noise.shape, dtype=int))
 
-    def step(actor, carried, t, deterministic, alive):
+    def step(actor, carry, t, deterministic, is_alive):
         """Plays one step of one episode, and draws no more noise than that takes."""
         state = tree.unflatten(
-            restored(x, leaf.dtype) for x, leaf in zip(carried.state, leaves, strict=True)
+            restored(x, leaf.dtype) for x, leaf in zip(carry.state, leaves, strict=True)
         )
-        alive = alive != 0
+        is_alive = is_alive != 0
         # ``episode.draw_noise`` splits the key where a chunk begins, and draws the noise of all its
         # steps from the second half. That of this step begins so many words later.
         chunk_step = t % length
-        keys = lax.cond(
-            chunk_step == 0, lambda keys: split(keys[0]), lambda keys: keys, carried.keys
-        )
+        keys = lax.cond(chunk_step == 0, lambda keys: split(keys[0]), lambda keys: keys, carry.keys)
         offset = (chunk_step * words_per_step).astype(jnp.uint32)
         noise = distribution.noise(at_counter(keys[1], offset), ())
-        result = episode.step(
-            env.step, act, distribution, actor, state, noise, alive, deterministic != 0
+        step_result = episode.step(
+            env.step, act, distribution, actor, state, noise, is_alive, deterministic != 0
         )
-        next_state = jax.tree.leaves(episode.hold(alive, result.state, state))
+        next_state = jax.tree.leaves(episode.hold(is_alive, step_result.state, state))
         return StepResult(
-            record=[result.observation, result.action, result.reward],
-            alive=result.alive.astype(jnp.int32),
-            broken=result.broken.astype(jnp.int32),
+            record=[step_result.observation, step_result.action, step_result.reward],
+            alive=step_result.alive.astype(jnp.int32),
+            broken=step_result.broken.astype(jnp.int32),
             carried=Carried([stored(x) for x in next_state], keys),
         )
 
@@ -157,14 +155,14 @@ def build_program(
         examples = examples[:-1]
     num_actor = len(jax.tree.leaves(actor))
 
-    def write_cpu(written: scalarized.Scalarized, target: machine.Machine) -> str:
+    def write_cpu(expansion: scalarized.Scalarized, target: machine.Machine) -> str:
         """Writes the step, the loop over episodes and the way from XLA to it, as LLVM IR."""
         buffers = [x for x in jax.tree.leaves((actor, examples[1].state)) if np.prod(x.shape)]
-        sizes = [np.dtype(x.dtype).itemsize for x in written.out_avals[: kernel.NUM_RECORDS]]
+        sizes = [np.dtype(x.dtype).itemsize for x in expansion.out_avals[: kernel.NUM_RECORDS]]
         num_args = kernel.NUM_CONTROLS + len(buffers)
         entry = handler.handler_text(num_args, [*sizes, 4, 4, 4], target.lanes)
         entry += handler.flush(target.triple)
-        return entry + kernel.kernel_text(written, num_actor, target.lanes)
+        return entry + kernel.kernel_text(expansion, num_actor, target.lanes)
 
     writers = Writers(
         write_cpu,
@@ -189,7 +187,7 @@ class Writers(NamedTuple):
 
 
 def load(
-    use: str,
+    job: str,
     env: Environment | None,
     function: Callable[..., Any],
     examples: Sequence[PyTree],
@@ -201,7 +199,7 @@ def load(
     They are those of what the function returns.
 
     Args:
-      use: what the writers write around the function.
+      job: what the writers write around the function.
       env: the environment that the function plays, if it plays one.
       function: what is written out.
       examples: its arguments, or their shapes.
@@ -215,12 +213,12 @@ def load(
     target = machine.this_machine() if available.platform() == "cpu" else None
     unrolled = SCANS
     if target is None:
-        team_kernel_and_shapes = _by_teams(use, env, function, examples, writers)
+        team_kernel_and_shapes = _by_teams(job, env, function, examples, writers)
         if team_kernel_and_shapes is not None:
             return team_kernel_and_shapes
         unrolled = _GPU_SCANS
-    traced, shapes = scalarized.trace(function, *examples, unrolled=unrolled)
-    source = f"{use} {jaxprs.fingerprint(traced)} {objects.source_digest(*_WRITERS)}"
+    program, shapes = scalarized.trace(function, *examples, unrolled=unrolled)
+    source = f"{job} {jaxprs.fingerprint(program)} {objects.source_digest(*_WRITERS)}"
 
     def write() -> tuple[scalarized.Scalarized, str]:
         """Returns the function written out, and a line of LLVM IR that says what it is.
@@ -228,41 +226,41 @@ def load(
         That takes seconds, and is done where there is no code of this source.
         """
         entries = 0 if env is None else observation_size(env)
-        written = _write_out(traced, shapes, entries)
-        return written, f"; {name}, {sum(written.operations.values()):,} scalar operations\n"
+        expansion = _write_out(program, shapes, entries)
+        return expansion, f"; {name}, {sum(expansion.operations.values()):,} scalar operations\n"
 
     if target:
 
         def write_cpu() -> str:
-            written, title = write()
-            return title + writers.cpu(written, target)
+            expansion, title = write()
+            return title + writers.cpu(expansion, target)
 
-        code = machine.load_module(source, write_cpu, handler.NAMES, target, objects.folder())
+        code = machine.load_module(source, write_cpu, handler.SYMBOLS, target, objects.folder())
         return code, shapes
 
     def write_gpu() -> Source:
-        written, title = write()
-        kernel_source = writers.gpu(written)
+        expansion, title = write()
+        kernel_source = writers.gpu(expansion)
         return kernel_source._replace(text=title + kernel_source.text)
 
     capability = gpu_seam.compute_capability()
     return ptx.load_kernel(source, write_gpu, capability, objects.folder()), shapes
 
 
-def _write_out(traced: jaxprs.Program, shapes: Any, entries: int = 0) -> scalarized.Scalarized:
+def _write_out(program: jaxprs.Program, shapes: Any, entries: int = 0) -> scalarized.Scalarized:
     """Returns a traced function written out; of an observation of many entries it is too large.
 
     Raises:
       UnsupportedPrimitive: it closes over an array that has no value yet.
     """
-    written = scalarized.build(traced, shapes, BRANCH_COST, SCANS, entries=entries)
-    if written.captured:
+    expansion = scalarized.build(program, shapes, BRANCH_COST, SCANS, entries=entries)
+    if expansion.captured:
         raise scalar.UnsupportedPrimitive("it needs an array of an outer transformation")
-    return written
+    return expansion
 
 
 def _by_teams(
-    use: str, env: Any, function: Callable[..., Any], examples: Sequence[PyTree], writers: Writers
+    job: str, env: Any, function: Callable[..., Any], examples: Sequence[PyTree], writers: Writers
 ) -> tuple[ptx.Kernel, Any] | None:
     """Returns what ``load`` does, for teams of lanes; None if they do not play this."""
     if team.why_not(env) is not None:
@@ -270,19 +268,19 @@ def _by_teams(
     model = team.physics_model(env)
     with base.keeping_whole():
         try:
-            traced, shapes = scalarized.trace(function, *examples)
+            program, shapes = scalarized.trace(function, *examples)
             # A kernel has the tables of one model. A function that simulates none, or another one,
             # is played by a thread an episode, which computes the physics as it was traced.
-            if model is None or {*scalar.simulated_models(traced)} != {model.digest}:
+            if model is None or {*scalar.simulated_models(program)} != {model.digest}:
                 return None
             physics = team.team_physics(model)
-            source = f"{jaxprs.fingerprint(traced)} {physics} {objects.source_digest(*_WRITERS)}"
+            source = f"{jaxprs.fingerprint(program)} {physics} {objects.source_digest(*_WRITERS)}"
 
             def write() -> Source:
-                return writers.team(_write_out(traced, shapes), physics)
+                return writers.team(_write_out(program, shapes), physics)
 
             capability = gpu_seam.compute_capability()
-            return ptx.load_kernel(f"{use} {source}", write, capability, objects.folder()), shapes
+            return ptx.load_kernel(f"{job} {source}", write, capability, objects.folder()), shapes
         except (scalar.UnsupportedPrimitive, scalar.TooLarge, NotImplementedError) as error:
             warnings.warn(f"a thread plays an episode, slower than lanes: {error}", stacklevel=2)
             return None
@@ -320,9 +318,9 @@ def machine_map(
         )
         return [stored(x) for x in jax.tree.leaves(function(*args))]
 
-    results, out_tree = jax.tree.flatten(base.shapes(function, *examples))
+    result_leaves, out_tree = jax.tree.flatten(base.shapes(function, *examples))
     stored_arguments = [jax.eval_shape(stored, x) for x in arguments]
-    stored_results = [jax.eval_shape(stored, x) for x in results]
+    stored_results = [jax.eval_shape(stored, x) for x in result_leaves]
     for leaf in stored_arguments + stored_results:
         if np.dtype(leaf.dtype).itemsize not in (4, 8):
             raise TypeError(f"it has numbers of {leaf.dtype}, not of 32 or 64 bits")
@@ -332,41 +330,41 @@ def machine_map(
     def map_rows(*args: PyTree) -> Any:
         """Returns the function's results of arguments whose first axis is N, in every leaf."""
         values = jax.tree.leaves(args)
-        num = values[0].shape[0]
+        batch = values[0].shape[0]
         # A leaf without numbers has no buffer: it is left out here, and zeros stand for it below.
-        rows = [stored(x).reshape(num, -1) for x in values if x.size]
-        shapes = [jax.ShapeDtypeStruct((num, x.size), x.dtype) for x in stored_results if x.size]
+        rows = [stored(x).reshape(batch, -1) for x in values if x.size]
+        shapes = [jax.ShapeDtypeStruct((batch, x.size), x.dtype) for x in stored_results if x.size]
         if isinstance(code, machine.Code):
             # 0 threads stand for all that XLA has.
             columns = iter(cpu_seam.call(code, shapes, jnp.int32(0), *rows))
         else:
             columns = iter(gpu_seam.launch_map(code, shapes, *rows))
         outputs = []
-        for x in results:
+        for x in result_leaves:
             if x.size:
-                outputs.append(next(columns).reshape(num, *x.shape).astype(x.dtype))
+                outputs.append(next(columns).reshape(batch, *x.shape).astype(x.dtype))
             else:
-                outputs.append(jnp.zeros((num, *x.shape), x.dtype))
+                outputs.append(jnp.zeros((batch, *x.shape), x.dtype))
         return out_tree.unflatten(outputs)
 
     return map_rows
 
 
-def _write_cpu(written: scalarized.Scalarized, target: machine.Machine) -> str:
+def _write_cpu(expansion: scalarized.Scalarized, target: machine.Machine) -> str:
     """Writes a function, and all around it, as LLVM IR."""
-    num_args = 1 + sum(bool(np.prod(x.shape)) for x in written.in_avals)
-    sizes = [np.dtype(x.dtype).itemsize for x in written.out_avals if np.prod(x.shape)]
-    entry = handler.handler_text(num_args, sizes, target.lanes, kernel.MAPPED, zeroed=False)
-    return entry + handler.flush(target.triple) + kernel.mapping_text(written, target.lanes)
+    num_args = 1 + sum(bool(np.prod(x.shape)) for x in expansion.in_avals)
+    sizes = [np.dtype(x.dtype).itemsize for x in expansion.out_avals if np.prod(x.shape)]
+    entry = handler.handler_text(num_args, sizes, target.lanes, kernel.MAPPING, is_zeroed=False)
+    return entry + handler.flush(target.triple) + kernel.mapping_text(expansion, target.lanes)
 
 
 def name_of(env: Any) -> str:
     """Returns the class of an environment, and of those in it if it wraps one."""
     name = type(env).__name__
-    inner = getattr(env, "env", None)
-    if inner is None:
+    inner_env = getattr(env, "env", None)
+    if inner_env is None:
         return name
-    return f"{name} of {name_of(inner)}"
+    return f"{name} of {name_of(inner_env)}"
 
 
 def refusal(error: Exception) -> str:

@@ -82,11 +82,11 @@ def vmap_rollout(
     no_episode = jnp.zeros(num_episodes, bool)
     if limit is None:
         steps_left = None
-        alive = no_episode | active
+        is_alive = no_episode | active
     else:
         steps_left = jnp.broadcast_to(limit, num_episodes)
-        alive = active & (steps_left > 0)
-    progress = _Progress(state, alive, nonfinite=no_episode, steps_left=steps_left)
+        is_alive = active & (steps_left > 0)
+    progress = _Progress(state, is_alive, nonfinite=no_episode, steps_left=steps_left)
     records = _empty_records(step, progress, distribution, horizon)
     progress, (observation, action, reward, mask), simulated = episode.play_chunks(
         lambda noise, progress: lax.scan(step, progress, noise),
@@ -120,16 +120,16 @@ def _step(
       The progress, and the records of the step: observation [O, N], action [N, A], reward [N] and
       whether the episode was running before it [N].
     """
-    state, alive, nonfinite, steps_left = progress
-    result = episode.step(env_step, act, distribution, actor, state, noise, alive, deterministic)
-    state = episode.hold(alive, result.state, state)
+    state, is_alive, nonfinite, steps_left = progress
+    step = episode.step(env_step, act, distribution, actor, state, noise, is_alive, deterministic)
+    state = episode.hold(is_alive, step.state, state)
     # The mask is of the episodes that ran before the step: their last step counts.
-    record = (result.observation, result.action, result.reward, alive)
-    alive = result.alive
+    record = (step.observation, step.action, step.reward, is_alive)
+    is_alive = step.alive
     if steps_left is not None:
         steps_left = steps_left - 1
-        alive &= steps_left > 0
-    return _Progress(state, alive, nonfinite | result.broken, steps_left), record
+        is_alive &= steps_left > 0
+    return _Progress(state, is_alive, nonfinite | step.broken, steps_left), record
 
 
 def _empty_records(

@@ -10,7 +10,7 @@ from mjx_reinforce.engine.gpu.team_kernel import Physics
 #: Models of fewer degrees of freedom play faster by a thread an episode.
 _LEAST_DOFS = 14
 #: Models of so many degrees of freedom, or more, are played by 32 lanes, others by 16.
-_WIDE = 16
+_WIDE_DOFS = 16
 #: CUDA's number of the attribute of a GPU: bytes of shared memory that a block may have.
 _SHARED_OF_BLOCK = 97
 
@@ -43,10 +43,10 @@ def physics_model(env: Any) -> PhysicsModel | None:
     """Returns what an environment simulates, within wrappers too; None if it does not offer it."""
     while hasattr(env, "env"):
         env = env.env
-    offer = getattr(env, "physics_model", None)
-    if offer is None:
+    get_model = getattr(env, "physics_model", None)
+    if get_model is None:
         return None
-    return offer()
+    return get_model()
 
 
 def team_physics(model: PhysicsModel) -> Physics:
@@ -64,7 +64,7 @@ def team_physics(model: PhysicsModel) -> Physics:
 
 def _lanes(model: PhysicsModel) -> int:
     """Returns how many lanes play an episode."""
-    return 32 if model.mj_model.nv >= _WIDE else 16
+    return 32 if model.mj_model.nv >= _WIDE_DOFS else 16
 
 
 def _shared_memory() -> int:

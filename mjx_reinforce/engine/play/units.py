@@ -58,8 +58,8 @@ def tanh_network(layers: Sequence[Mapping[str, jax.Array]], x: jax.Array) -> jax
 
 def _whole_network(layers: Sequence[Mapping[str, jax.Array]], x: jax.Array) -> jax.Array:
     """Returns what ``tanh_network`` does, in an operation a layer, which device code computes."""
-    for number, layer in enumerate(layers):
-        name = "tanh_layer" if number + 1 < len(layers) else "layer"
+    for layer_index, layer in enumerate(layers):
+        name = "tanh_layer" if layer_index + 1 < len(layers) else "layer"
         weights = layer["kernel"]
         bias = layer["bias"]
         units = jax.ShapeDtypeStruct(bias.shape, jnp.result_type(x, weights, bias))

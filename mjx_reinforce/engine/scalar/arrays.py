@@ -76,15 +76,15 @@ class Layout:
     def pack(self, scalars: Sequence[Any]) -> list[Array]:
         """Makes the arrays of these scalars."""
         values = iter(scalars)
-        packed = []
+        packed_arrays = []
         for aval, size in zip(self._avals, self._sizes, strict=True):
-            packed.append(pack([next(values) for _ in range(size)], aval.shape, aval.dtype))
-        return packed
+            packed_arrays.append(pack([next(values) for _ in range(size)], aval.shape, aval.dtype))
+        return packed_arrays
 
     def repeat(self, facts: Sequence[Any]) -> list[Any]:
         """Lists what is known of each array once for each of its scalars."""
-        sized = zip(facts, self._sizes, strict=True)
-        return [fact for fact, size in sized for _ in range(size)]
+        layout_facts = zip(facts, self._sizes, strict=True)
+        return [fact for fact, size in layout_facts for _ in range(size)]
 
     def unpack(self, packed: Sequence[Array]) -> list[Any]:
         """Lists the scalars of these arrays."""

@@ -19,7 +19,7 @@ class Backend(abc.ABC, Generic[Value]):
     branch computes is known only inside, so it is run in an environment of its own (``inside``).
 
     OPERATIONS: what the backend makes of each operation, by name, with an entry for every
-      name of ``nodes.FACTS``; None for a backend without a table of its own.
+      name of ``nodes.OP_TRAITS``; None for a backend without a table of its own.
     """
 
     OPERATIONS: ClassVar[Mapping[str, Any] | None] = None
@@ -83,9 +83,9 @@ class Backend(abc.ABC, Generic[Value]):
           leaves: the values of the leaves that the body starts from.
         """
         # A copy: what the body computes is unknown around it, where it may not have run.
-        inner = {**values, **(leaves or {})}
-        self.run(body, inner)
-        return inner
+        inner_values = {**values, **(leaves or {})}
+        self.run(body, inner_values)
+        return inner_values
 
     def value(self, scalar: Scalar, values: dict[Node, Value]) -> Value:
         """Returns a scalar's value, reading leaves when they are first needed."""

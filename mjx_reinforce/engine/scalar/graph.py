@@ -18,7 +18,7 @@ from mjx_reinforce.engine.scalar.passes import simplify
 from mjx_reinforce.engine.scalar.size import MAX_SCALARS, TooLarge
 
 #: ``size`` foresees what is written; where it errs, writing ends here.
-_MOST = 3 * MAX_SCALARS
+_MAX_NODES = 3 * MAX_SCALARS
 
 
 class Graph:
@@ -70,7 +70,7 @@ class Graph:
 
         Inside of a jitted function of JAX no line is the user's.
         """
-        innermost_first = [eqn, *(self._equations[number] for number in reversed(self.path))]
+        innermost_first = [eqn, *(self._equations[index] for index in reversed(self.path))]
         return next(filter(None, map(jaxprs.source, innermost_first)), "an unknown line")
 
     def loop_body(self) -> AbstractContextManager[Scope]:
@@ -133,7 +133,7 @@ class Graph:
         """Applies one of the named operations to scalars."""
         # The last operand has the dtype of the result: of a selection the first is a predicate.
         dtype = args[-1].dtype
-        if nodes.FACTS[name].is_predicate:
+        if nodes.OP_TRAITS[name].is_predicate:
             dtype = nodes.BOOL
         return self.apply(Op(name), args, dtype)
 
@@ -153,11 +153,11 @@ class Graph:
             return simplify.fold(op, args, dtype)
         # Every request counts, also one that an existing node answers: it takes its time.
         self._num_applied += 1
-        if self._num_applied > _MOST:
-            raise TooLarge(f"written out it is more than {_MOST:,} scalar operations")
-        simpler = simplify.simplify(self, op, args, dtype)
-        if simpler is not None:
-            return simpler
+        if self._num_applied > _MAX_NODES:
+            raise TooLarge(f"written out it is more than {_MAX_NODES:,} scalar operations")
+        simple_form = simplify.simplify(self, op, args, dtype)
+        if simple_form is not None:
+            return simple_form
         return self._share(op, args, operands, dtype)
 
     def _share(
@@ -172,7 +172,7 @@ class Graph:
           dtype: that of the result.
         """
         identities = [arg if isinstance(arg, Node) else nodes.identity(arg) for arg in args]
-        commutes = nodes.FACTS[op.name].commutes
+        commutes = nodes.OP_TRAITS[op.name].commutes
         key = (op, frozenset(identities) if commutes else tuple(identities))
         # No node of these operands can be further outside than the innermost of them.
         outermost = max([node.scope.depth for node in operands])

@@ -20,7 +20,7 @@ from jax.extend import core
 from jax.interpreters import partial_eval
 
 from mjx_reinforce.engine.base import PyTree, is_key
-from mjx_reinforce.engine.scalar.nodes import FACTS
+from mjx_reinforce.engine.scalar.nodes import OP_TRAITS
 
 # The parameter under which a call-like primitive keeps the jaxpr that it calls.
 _CALLEE_PARAMS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
@@ -99,15 +99,15 @@ class Equation(Protocol):
 
 def trace(fn: Callable, *examples: PyTree) -> tuple[Program, Any]:
     """Returns fn's program for one example and the pytree of its output shapes."""
-    closed, out_shape = jax.make_jaxpr(fn, return_shape=True)(*examples)
-    return program(closed), out_shape
+    closed_jaxpr, out_shape = jax.make_jaxpr(fn, return_shape=True)(*examples)
+    return program(closed_jaxpr), out_shape
 
 
-def fingerprint(traced: Program) -> str:
+def fingerprint(root: Program) -> str:
     """Returns a hash of a program and of the constants in it, the same in every process."""
     # JAX itself leaves the addresses of functions out of a program's text.
-    digest = hashlib.sha256(str(traced.jaxpr).encode())
-    for const in [*traced.consts, *_inner_constants(traced.jaxpr)]:
+    digest = hashlib.sha256(str(root.jaxpr).encode())
+    for const in [*root.consts, *_inner_constants(root.jaxpr)]:
         if is_traced(const):
             digest.update(b"unknown")
         else:
@@ -120,8 +120,8 @@ def _inner_constants(jaxpr: core.Jaxpr) -> list[Any]:
     """Returns the constants of the programs that a program calls."""
     constants = []
     for eqn in jaxpr.eqns:
-        for inner in subprograms(eqn.params.values()):
-            constants += [*inner.consts, *_inner_constants(inner.jaxpr)]
+        for subprogram in subprograms(eqn.params.values()):
+            constants += [*subprogram.consts, *_inner_constants(subprogram.jaxpr)]
     return constants
 
 
@@ -136,9 +136,9 @@ def subprograms(params: Iterable[Any]) -> list[Program]:
     return programs
 
 
-def program(closed: Any) -> Program:
+def program(source: Any) -> Program:
     """Returns the program of a closed or an open jaxpr."""
-    return Program(getattr(closed, "jaxpr", closed), list(getattr(closed, "consts", ())))
+    return Program(getattr(source, "jaxpr", source), list(getattr(source, "consts", ())))
 
 
 def callee(eqn: Equation) -> Program | None:
@@ -149,8 +149,8 @@ def callee(eqn: Equation) -> Program | None:
     if eqn.primitive.name == "call_hi_primitive":  # JAX 0.12: composite primitives
         avals = [variable.aval for variable in eqn.invars]
         return program(jax.make_jaxpr(eqn.params["_prim"].expand)(*avals))
-    if eqn.primitive.name in _COMPOSED:  # a key is an array of its words
-        return program(jax.make_jaxpr(_COMPOSED[eqn.primitive.name](eqn))(*map(words, eqn.invars)))
+    if eqn.primitive.name in _RECIPES:  # a key is an array of its words
+        return program(jax.make_jaxpr(_RECIPES[eqn.primitive.name](eqn))(*map(words, eqn.invars)))
     return None
 
 
@@ -201,7 +201,7 @@ def _largest(eqn: Equation) -> Callable[[jax.Array], list[jax.Array]]:
 
 #: What other operations make up, and what is done to keys, as functions of their words:
 #: equation -> function.
-_COMPOSED: dict[str, Callable[[Equation], Callable[..., Any]]] = {
+_RECIPES: dict[str, Callable[[Equation], Callable[..., Any]]] = {
     "random_bits": lambda eqn: (
         lambda key: _implementation(eqn.invars[0]).random_bits(
             key, eqn.params["bit_width"], eqn.params["shape"]
@@ -273,11 +273,11 @@ def prune(fn: Callable) -> Callable:
     def pruned(*args: PyTree) -> Any:
         """Traces the function, drops what is dead, and evaluates the rest."""
         leaves, in_tree = jax.tree.flatten(args)
-        (jaxpr, consts), out_shape = trace(lambda *flat: fn(*in_tree.unflatten(flat)), *leaves)
-        outs = [True] * len(jaxpr.outvars)
-        jaxpr, _ = partial_eval.dce_jaxpr(jaxpr, outs, instantiate=True)
-        results = jax.core.eval_jaxpr(jaxpr, consts, *leaves)
-        return jax.tree.structure(out_shape).unflatten(results)
+        (jaxpr, consts), out_shape = trace(lambda *args: fn(*in_tree.unflatten(args)), *leaves)
+        is_used = [True] * len(jaxpr.outvars)
+        jaxpr, _ = partial_eval.dce_jaxpr(jaxpr, is_used, instantiate=True)
+        outputs = jax.core.eval_jaxpr(jaxpr, consts, *leaves)
+        return jax.tree.structure(out_shape).unflatten(outputs)
 
     return pruned
 
@@ -292,14 +292,14 @@ def live_equations(jaxpr: core.Jaxpr, live: Iterable[bool]) -> list[tuple[Any, l
       jaxpr: the equations.
       live: which of the jaxpr's outputs something reads.
     """
-    outs = zip(jaxpr.outvars, live, strict=True)
-    needed = {out for out, is_live in outs if is_live and not is_literal(out)}
+    outputs = zip(jaxpr.outvars, live, strict=True)
+    read_vars = {outvar for outvar, is_live in outputs if is_live and not is_literal(outvar)}
     equations = []
     # Backwards: whoever reads an equation's results comes behind it, and was looked at before.
     for eqn in reversed(jaxpr.eqns):
-        if any(out in needed for out in eqn.outvars):
-            equations.append((eqn, [out in needed for out in eqn.outvars]))
-            needed.update(atom for atom in eqn.invars if not is_literal(atom))
+        if any(outvar in read_vars for outvar in eqn.outvars):
+            equations.append((eqn, [outvar in read_vars for outvar in eqn.outvars]))
+            read_vars.update(atom for atom in eqn.invars if not is_literal(atom))
     return equations[::-1]
 
 
@@ -322,7 +322,7 @@ def source(eqn: Equation) -> str:
 
 def operation(name: str) -> Callable[..., Any]:
     """Returns JAX's function for an operation of the scalar graph."""
-    return getattr(lax, FACTS[name].in_jax or name)
+    return getattr(lax, OP_TRAITS[name].lax_name or name)
 
 
 def compute_constants(
@@ -331,8 +331,8 @@ def compute_constants(
     """Computes an operation of JAX on constants at once; takes about 1 ms."""
     # Also while an outer function is traced, where JAX would else trace this too.
     with jax.ensure_compile_time_eval():
-        arrays = [jax.numpy.asarray(operand) for operand in operands]
-        results = function(*arrays, **params)
-        if not isinstance(results, (list, tuple)):
-            results = [results]
-        return [np.asarray(array) for array in results]
+        values = [jax.numpy.asarray(operand) for operand in operands]
+        outputs = function(*values, **params)
+        if not isinstance(outputs, (list, tuple)):
+            outputs = [outputs]
+        return [np.asarray(output) for output in outputs]

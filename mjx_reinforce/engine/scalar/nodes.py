@@ -4,9 +4,9 @@ A *scalar* is a NumPy scalar (a constant) or a ``Node`` (a value that each lane 
 own of, or that all lanes share). The body of a loop and an expensive branch are scopes of their
 own: a node placed there is not visible outside.
 
-``FACTS`` is the one table of the operations, and of how each is computed. JAX computes an operation
-on lanes, NumPy computes it on constants. ``simplify`` lists what NumPy has no one function for, and
-a backend that does not go through JAX lists what it writes instead.
+``OP_TRAITS`` is the one table of the operations, and of how each is computed. JAX computes an
+operation on lanes, NumPy computes it on constants. ``simplify`` lists what NumPy has no one
+function for, and a backend that does not go through JAX lists what it writes instead.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ import numpy as np
 class Op(NamedTuple):
     """An elementwise operation. Equal operations are equal tuples.
 
-    name: a name of ``FACTS``; mostly that of a JAX primitive.
+    name: a name of ``OP_TRAITS``; mostly that of a JAX primitive.
     params: its parameters by name, sorted; few operations have any.
     """
 
@@ -27,61 +27,61 @@ class Op(NamedTuple):
     params: tuple[tuple[str, Hashable], ...] = ()
 
 
-class Facts(NamedTuple):
+class OpTraits(NamedTuple):
     """What is known of a name.
 
-    in_numpy: operands -> result; None where NumPy has no one function for it.
-    in_jax: the name of a function of ``jax.lax``, (operands, **parameters) -> result; "" where
+    numpy_function: operands -> result; None where NumPy has no one function for it.
+    lax_name: the name of a function of ``jax.lax``, (operands, **parameters) -> result; "" where
       that is the name of the operation.
     commutes: whether two operands may change places.
     is_predicate: whether the result is a bool whatever the operands are.
     has_params: whether the parameters of the JAX primitive are part of the operation.
     """
 
-    in_numpy: Callable[..., Any] | None = None
-    in_jax: str = ""
+    numpy_function: Callable[..., Any] | None = None
+    lax_name: str = ""
     commutes: bool = False
     is_predicate: bool = False
     has_params: bool = False
 
 
-def _named(*names: str, **facts: Any) -> dict[str, Facts]:
-    """Returns the facts of operations that NumPy has under the same names."""
-    return {name: Facts(getattr(np, name), **facts) for name in names}
+def _named(*op_names: str, **traits: Any) -> dict[str, OpTraits]:
+    """Returns the traits of operations that NumPy has under the same names."""
+    return {name: OpTraits(getattr(np, name), **traits) for name in op_names}
 
 
 #: Every operation that a rule can make.
-FACTS: dict[str, Facts] = {
-    "add": Facts(np.add, commutes=True),
-    "mul": Facts(np.multiply, commutes=True),
-    "max": Facts(np.maximum, commutes=True),
-    "min": Facts(np.minimum, commutes=True),
-    "and": Facts(np.bitwise_and, in_jax="bitwise_and", commutes=True),
-    "or": Facts(np.bitwise_or, in_jax="bitwise_or", commutes=True),
-    "xor": Facts(np.bitwise_xor, in_jax="bitwise_xor", commutes=True),
-    "eq": Facts(np.equal, is_predicate=True),
-    "ne": Facts(np.not_equal, is_predicate=True),
-    "lt": Facts(np.less, is_predicate=True),
-    "le": Facts(np.less_equal, is_predicate=True),
-    "gt": Facts(np.greater, is_predicate=True),
-    "ge": Facts(np.greater_equal, is_predicate=True),
-    "is_finite": Facts(np.isfinite, is_predicate=True),
-    "sub": Facts(np.subtract),
-    "pow": Facts(np.power),
-    "atan2": Facts(np.arctan2),
-    "nextafter": Facts(np.nextafter),
-    "shift_left": Facts(np.left_shift),
-    "neg": Facts(np.negative),
-    "not": Facts(np.invert, in_jax="bitwise_not"),
+OP_TRAITS: dict[str, OpTraits] = {
+    "add": OpTraits(np.add, commutes=True),
+    "mul": OpTraits(np.multiply, commutes=True),
+    "max": OpTraits(np.maximum, commutes=True),
+    "min": OpTraits(np.minimum, commutes=True),
+    "and": OpTraits(np.bitwise_and, lax_name="bitwise_and", commutes=True),
+    "or": OpTraits(np.bitwise_or, lax_name="bitwise_or", commutes=True),
+    "xor": OpTraits(np.bitwise_xor, lax_name="bitwise_xor", commutes=True),
+    "eq": OpTraits(np.equal, is_predicate=True),
+    "ne": OpTraits(np.not_equal, is_predicate=True),
+    "lt": OpTraits(np.less, is_predicate=True),
+    "le": OpTraits(np.less_equal, is_predicate=True),
+    "gt": OpTraits(np.greater, is_predicate=True),
+    "ge": OpTraits(np.greater_equal, is_predicate=True),
+    "is_finite": OpTraits(np.isfinite, is_predicate=True),
+    "sub": OpTraits(np.subtract),
+    "pow": OpTraits(np.power),
+    "atan2": OpTraits(np.arctan2),
+    "nextafter": OpTraits(np.nextafter),
+    "shift_left": OpTraits(np.left_shift),
+    "neg": OpTraits(np.negative),
+    "not": OpTraits(np.invert, lax_name="bitwise_not"),
     **_named("abs", "sign", "floor", "ceil", "sqrt", "cbrt", "exp", "exp2", "expm1"),
     **_named("log", "log1p", "sin", "cos", "tan", "sinh", "cosh", "tanh"),
-    **{f"a{name}": Facts(getattr(np, f"arc{name}")) for name in ("sin", "cos", "tan")},
-    **{f"a{name}": Facts(getattr(np, f"arc{name}")) for name in ("sinh", "cosh", "tanh")},
-    **dict.fromkeys(("select_n", "div", "rem", "rsqrt", "logistic"), Facts()),
-    **dict.fromkeys(("erf", "erf_inv", "erfc", "round"), Facts(has_params=True)),
-    **dict.fromkeys(("clz", "population_count", "reduce_precision"), Facts(has_params=True)),
-    **dict.fromkeys(("convert_element_type", "bitcast_convert_type"), Facts(has_params=True)),
-    **dict.fromkeys(("shift_right_arithmetic", "shift_right_logical"), Facts(has_params=True)),
+    **{f"a{name}": OpTraits(getattr(np, f"arc{name}")) for name in ("sin", "cos", "tan")},
+    **{f"a{name}": OpTraits(getattr(np, f"arc{name}")) for name in ("sinh", "cosh", "tanh")},
+    **dict.fromkeys(("select_n", "div", "rem", "rsqrt", "logistic"), OpTraits()),
+    **dict.fromkeys(("erf", "erf_inv", "erfc", "round"), OpTraits(has_params=True)),
+    **dict.fromkeys(("clz", "population_count", "reduce_precision"), OpTraits(has_params=True)),
+    **dict.fromkeys(("convert_element_type", "bitcast_convert_type"), OpTraits(has_params=True)),
+    **dict.fromkeys(("shift_right_arithmetic", "shift_right_logical"), OpTraits(has_params=True)),
 }
 
 

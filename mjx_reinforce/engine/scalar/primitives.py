@@ -22,7 +22,7 @@ kept whole      ``base.keeping_whole``, in ``play/program.py`` around
                 shapes does not trace the physics.
 ==============  ======================================================================
 
-Who asks, and why:
+Who asks, and why (kept by hand: a new caller adds its row):
 
 ====================================  =============================================================
 ``is_written_out``
@@ -110,45 +110,45 @@ _SKIPPABLE = core.Primitive("skippable")
 _SKIPPABLE.multiple_results = True
 
 
-def skippable(needed: jax.Array, compute: Callable[[], PyTree], otherwise: PyTree) -> Any:
-    """Returns what ``compute`` does; it need not run where ``needed`` is False.
+def skippable(is_needed: jax.Array, compute: Callable[[], PyTree], default: PyTree) -> Any:
+    """Returns what ``compute`` does; it need not run where ``is_needed`` is False.
 
     Args:
-      needed: [] bool. Where it is False, ``compute()`` equals ``otherwise``.
-      compute: no arguments -> a result of the structure, shapes and dtypes of ``otherwise``.
-      otherwise: the result where it is not needed.
+      is_needed: [] bool. Where it is False, ``compute()`` equals ``default``.
+      compute: no arguments -> a result of the structure, shapes and dtypes of ``default``.
+      default: the result where it is not needed.
     """
     if not is_written_out():
-        return jax.lax.cond(needed, compute, lambda: otherwise)
-    leaves, tree = jax.tree.flatten(otherwise)
+        return jax.lax.cond(is_needed, compute, lambda: default)
+    leaves, tree = jax.tree.flatten(default)
     # What the computation reads of the trace around it becomes operands: a primitive's parameters
     # must not hold values of a trace.
     program, _ = jaxprs.trace(lambda: jax.tree.leaves(compute()))
     computation = jax.make_jaxpr(lambda *xs: jax.core.eval_jaxpr(program.jaxpr, xs))(
         *program.consts
     )
-    results = _SKIPPABLE.bind(
-        needed, *leaves, *program.consts, computation=computation, num_results=len(leaves)
+    outputs = _SKIPPABLE.bind(
+        is_needed, *leaves, *program.consts, computation=computation, num_results=len(leaves)
     )
-    return tree.unflatten(results)
+    return tree.unflatten(outputs)
 
 
-def _plain_skippable(needed: Any, *operands: Any, computation: Any, num_results: int) -> list[Any]:
-    otherwise = list(operands[:num_results])
+def _plain_skippable(flag: Any, *operands: Any, computation: Any, num_results: int) -> list[Any]:
+    default = list(operands[:num_results])
     consts = operands[num_results:]
-    return jax.lax.cond(needed, lambda: core.jaxpr_as_fun(computation)(*consts), lambda: otherwise)
+    return jax.lax.cond(flag, lambda: core.jaxpr_as_fun(computation)(*consts), lambda: default)
 
 
 def _batched_skippable(operands: Sequence[Any], axes: Sequence[int | None], **params: Any) -> tuple:
     # Mapped, one example may need it where another does not: as a ``cond`` it becomes a selection.
-    results = jax.vmap(functools.partial(_plain_skippable, **params), tuple(axes))(*operands)
-    return results, [0] * len(results)
+    outputs = jax.vmap(functools.partial(_plain_skippable, **params), tuple(axes))(*operands)
+    return outputs, [0] * len(outputs)
 
 
 def _derivative_of_skippable(primals: Any, tangents: Any, **params: Any) -> tuple:
-    plain = functools.partial(_plain_skippable, **params)
+    function = functools.partial(_plain_skippable, **params)
     # ``jvp`` takes no symbolic zeros, which stand for operands that nothing is differentiated by.
-    return jax.jvp(plain, tuple(primals), tuple(map(ad.instantiate_zeros, tangents)))
+    return jax.jvp(function, tuple(primals), tuple(map(ad.instantiate_zeros, tangents)))
 
 
 ad.primitive_jvps[_SKIPPABLE] = _derivative_of_skippable
@@ -157,9 +157,9 @@ batching.primitive_batchers[_SKIPPABLE] = _batched_skippable
 
 
 #: Its operands are those of the operation; it is traced only for backends that know it.
-_WHOLE = core.Primitive("whole")
-_WHOLE.multiple_results = True
-_WHOLE.def_abstract_eval(
+_WHOLE_PRIMITIVE = core.Primitive("whole")
+_WHOLE_PRIMITIVE.multiple_results = True
+_WHOLE_PRIMITIVE.def_abstract_eval(
     lambda *_, results, **__: [jax.core.ShapedArray(shape, dtype) for _, shape, dtype in results]
 )
 
@@ -176,14 +176,14 @@ def whole(
       model: the digest of the ``PhysicsModel`` that it simulates; "" if it simulates none.
     """
     facts = tuple((field, x.shape, np.dtype(x.dtype)) for field, x in results.items())
-    arrays = _WHOLE.bind(*args, name=name, results=facts, model=model)
+    arrays = _WHOLE_PRIMITIVE.bind(*args, name=name, results=facts, model=model)
     return dict(zip(results, arrays, strict=True))
 
 
-def simulated_models(traced: jaxprs.Program) -> Iterator[str]:
+def simulated_models(root: jaxprs.Program) -> Iterator[str]:
     """Yields, once a call, the digests of the models that a program simulates by ``whole``."""
-    for eqn in traced.jaxpr.eqns:
-        if eqn.primitive is _WHOLE and eqn.params["model"]:
+    for eqn in root.jaxpr.eqns:
+        if eqn.primitive is _WHOLE_PRIMITIVE and eqn.params["model"]:
             yield eqn.params["model"]
         yield from itertools.chain(*map(simulated_models, jaxprs.subprograms(eqn.params.values())))
 
@@ -206,7 +206,7 @@ def any_lane(predicate: jax.Array) -> jax.Array:
 
 
 @any_lane.def_vmap
-def _reduce_outer_axis(axis_size: int, in_batched: list[bool], predicate: jax.Array) -> Any:
-    del axis_size, in_batched
+def _reduce_outer_axis(axis_size: int, is_batched: list[bool], predicate: jax.Array) -> Any:
+    del axis_size, is_batched
     # The array with its new axis is reduced as a whole, so the result is the same for all examples.
     return any_lane(predicate), False

@@ -21,7 +21,7 @@ from mjx_reinforce.engine.scalar.rules import indexing, loops, reductions, struc
 _ARRAY_RULES = {**structural.RULES, **reductions.RULES, **indexing.RULES}
 #: What makes keys of words and words of keys.
 _KEYS_TO_WORDS = ("random_wrap", "random_unwrap")
-_CONTROL = {
+_CONTROL_RULES = {
     "while": loops.while_rule,
     "scan": loops.scan_rule,
     "cond": loops.cond_rule,
@@ -116,15 +116,15 @@ def build(
         varying = [True] * len(in_avals)
     # Constants that an outer transformation traces are further inputs, of which all lanes have the
     # same.
-    captured = [*filter(jaxprs.is_traced, program.consts)]
-    facts = [*zip(in_avals, varying, strict=True), *((jax.typeof(x), False) for x in captured)]
-    inputs = [_input_array(graph, k, aval, varies) for k, (aval, varies) in enumerate(facts)]
-    captured_inputs = dict(zip(map(id, captured), inputs[len(in_avals) :], strict=True))
+    closures = [*filter(jaxprs.is_traced, program.consts)]
+    facts = [*zip(in_avals, varying, strict=True), *((jax.typeof(x), False) for x in closures)]
+    inputs = [_input_array(graph, k, aval, is_lane) for k, (aval, is_lane) in enumerate(facts)]
+    captured_inputs = dict(zip(map(id, closures), inputs[len(in_avals) :], strict=True))
     program = program._replace(consts=[captured_inputs.get(id(x), x) for x in program.consts])
     # Folding may divide by zero in a branch that no lane takes.
     with np.errstate(all="ignore"):
-        results = run(graph, program, inputs[: len(in_avals)])
-    outputs = [arrays.elements(array) for array in results]
+        leaves = run(graph, program, inputs[: len(in_avals)])
+    outputs = [arrays.elements(leaf) for leaf in leaves]
     out_avals, out_tree = jax.tree.flatten(out_shape)
     return Scalarized(
         in_avals=in_avals,
@@ -132,7 +132,7 @@ def build(
         out_avals=out_avals,
         outputs=outputs,
         schedule=liveness.schedule(graph.scope, (x for leaf in outputs for x in leaf)),
-        captured=captured,
+        captured=closures,
     )
 
 
@@ -168,8 +168,8 @@ def run(
         return jaxprs.literal_value(atom) if jaxprs.is_literal(atom) else values[atom]
 
     for eqn, live_results in jaxprs.live_equations(jaxpr, live):
-        results = _apply(graph, eqn, live_results, [read(atom) for atom in eqn.invars])
-        values.update(zip(eqn.outvars, results, strict=True))
+        outputs = _apply(graph, eqn, live_results, [read(atom) for atom in eqn.invars])
+        values.update(zip(eqn.outvars, outputs, strict=True))
     return [
         read(out) if is_live else arrays.zeros(out.aval)
         for out, is_live in zip(jaxpr.outvars, live, strict=True)
@@ -181,14 +181,14 @@ def _apply(
 ) -> list:
     """Applies the rule of one equation; what has no rule may call a program that can be run."""
     name = eqn.primitive.name
-    if name in _CONTROL:
+    if name in _CONTROL_RULES:
         with graph.evaluating(eqn):
-            return _CONTROL[name](graph, functools.partial(run, graph), eqn, live, *operands)
+            return _CONTROL_RULES[name](graph, functools.partial(run, graph), eqn, live, *operands)
     if name in _ARRAY_RULES:
         if name not in _KEYS_TO_WORDS and any(is_key(atom.aval) for atom in eqn.invars):
             return _word_by_word(graph, eqn, operands)
-        results = zip(_ARRAY_RULES[name](graph, eqn, *operands), eqn.outvars, strict=True)
-        return [arrays.settle(array, out.aval.dtype) for array, out in results]
+        outputs = zip(_ARRAY_RULES[name](graph, eqn, *operands), eqn.outvars, strict=True)
+        return [arrays.settle(leaf, out.aval.dtype) for leaf, out in outputs]
     program = jaxprs.callee(eqn)
     if program is not None:
         with graph.evaluating(eqn):
@@ -202,14 +202,14 @@ def _apply(
 
 def _word_by_word(graph: Graph, eqn: jaxprs.Equation, operands: list[np.ndarray]) -> list:
     """Applies a rule that moves keys, whose words are their arrays' last axis."""
-    are_keys = [is_key(atom.aval) for atom in eqn.invars]
+    is_key_arg = [is_key(atom.aval) for atom in eqn.invars]
     rule = _ARRAY_RULES[eqn.primitive.name]
     word_eqn = jaxprs.on_words(eqn)
     planes = []
-    for k in range(operands[are_keys.index(True)].shape[-1]):
+    for k in range(operands[is_key_arg.index(True)].shape[-1]):
         # The k-th word of each key; indices and such are the same for all words.
         plane = [
-            x[..., k] if has_words else x for x, has_words in zip(operands, are_keys, strict=True)
+            x[..., k] if has_words else x for x, has_words in zip(operands, is_key_arg, strict=True)
         ]
         planes.append(rule(graph, word_eqn, *plane))
     return [np.stack(arrays.together(words), -1) for words in zip(*planes, strict=True)]

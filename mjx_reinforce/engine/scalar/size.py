@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from mjx_reinforce.engine.scalar import jaxprs
-from mjx_reinforce.engine.scalar.nodes import FACTS
+from mjx_reinforce.engine.scalar.nodes import OP_TRAITS
 
 #: What is larger takes more than some 80 s to write and compile. On two quiet cores a training had
 #: started after 48 s with Humanoid-v5 (1.9 million), 54 s with dm_control's humanoid (2.7 million).
@@ -19,7 +19,7 @@ MAX_SCALARS = 4_000_000
 _PER_PAIR = 1.35
 #: A loop's body is written again and again until what never changes in it is known.
 _LOOP = 2
-_ELEMENTWISE = {*FACTS, "integer_pow", "square", "add_any", "clamp"}
+_ELEMENTWISE = {*OP_TRAITS, "integer_pow", "square", "add_any", "clamp"}
 
 
 class TooLarge(NotImplementedError):  # noqa: N818 (reads as what it is)
@@ -77,16 +77,16 @@ def _equation_size(eqn: Any, defaults: Mapping[Any, int | None]) -> int:
     if name == "skippable":
         return num_scalars(jaxprs.program(params["computation"]))
     if name == "while":
-        bodies = (params[part] for part in ("cond_jaxpr", "body_jaxpr"))
+        bodies = (params[param] for param in ("cond_jaxpr", "body_jaxpr"))
         return _LOOP * sum(num_scalars(jaxprs.program(body)) for body in bodies)
     if name == "scan":
         body = min(_LOOP, params["length"]) * num_scalars(jaxprs.program(params["jaxpr"]))
         return body + _entries(eqn.invars) + _entries(eqn.outvars)
     num_results = _entries(eqn.outvars)
     if name == "dot_general":
-        (contracted, _), _ = params["dimension_numbers"]
+        (sum_axes, _), _ = params["dimension_numbers"]
         # A product and a sum for each pair of contracted entries.
-        return 2 * num_results * math.prod(eqn.invars[0].aval.shape[axis] for axis in contracted)
+        return 2 * num_results * math.prod(eqn.invars[0].aval.shape[axis] for axis in sum_axes)
     if name in ("cholesky", "triangular_solve"):
         # An entry of the result is a sum over a row that is half full on average: n products and
         # sums.

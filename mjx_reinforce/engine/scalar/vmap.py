@@ -54,30 +54,30 @@ def vmap(
     example_fn = jax.custom_batching.custom_vmap(lambda *args: fn(*args))
 
     @example_fn.def_vmap
-    def _(batch, mapped, *args):
+    def _(batch, axes, *args):
         """Returns the results of a batch, and that the batch is the first axis of each."""
-        varying = jax.tree.leaves(mapped)
+        varying = jax.tree.leaves(axes)
         leaves, tree = jax.tree.flatten(args)
         examples = [
-            jax.ShapeDtypeStruct(jnp.shape(x)[varies:], jnp.result_type(x))
-            for x, varies in zip(leaves, varying, strict=True)
+            jax.ShapeDtypeStruct(jnp.shape(x)[is_varying:], jnp.result_type(x))
+            for x, is_varying in zip(leaves, varying, strict=True)
         ]
-        traced = scalarized.trace(fn, *tree.unflatten(examples))
-        written = scalarized.build(*traced, branch_cost, varying=varying)
-        return evaluate(written, leaves, varying), jax.tree.map(lambda _: True, traced[1])
+        program = scalarized.trace(fn, *tree.unflatten(examples))
+        expansion = scalarized.build(*program, branch_cost, varying=varying)
+        return evaluate(expansion, leaves, varying), jax.tree.map(lambda _: True, program[1])
 
     return functools.wraps(fn)(jax.vmap(example_fn, in_axes, out_axes))
 
 
-def evaluate(written: scalarized.Scalarized, leaves: Sequence[Any], varying: Sequence[bool]) -> Any:
+def evaluate(program: scalarized.Scalarized, leaves: Sequence[Any], varying: Sequence[bool]) -> Any:
     """Evaluates a function for every example of a batch, the first axis of all results.
 
     Args:
-      written: the function.
+      program: the function.
       leaves: of its arguments.
       varying: whether the first axis of each is the batch; one at least is so.
     """
-    count = sum(written.operations.values())
+    count = sum(program.operations.values())
     if count > MAX_OPERATIONS:
         warnings.warn(
             f"written out this function is {count:,} scalar operations, and XLA takes minutes "
@@ -87,22 +87,22 @@ def evaluate(written: scalarized.Scalarized, leaves: Sequence[Any], varying: Seq
     batch = leaves[list(varying).index(True)].shape[0]
     # [entries, N] of an argument that varies, so that a scalar's lane is a contiguous row.
     rows = [
-        jnp.moveaxis(x, 0, -1).reshape(-1, batch) if varies else jnp.reshape(x, -1)
-        for x, varies in zip(leaves, varying, strict=True)
+        jnp.moveaxis(x, 0, -1).reshape(-1, batch) if is_varying else jnp.reshape(x, -1)
+        for x, is_varying in zip(leaves, varying, strict=True)
     ]
-    rows += [x.reshape(-1) for x in written.captured]
+    rows += [x.reshape(-1) for x in program.captured]
 
     def read(place: tuple[int, int]) -> jax.Array:
         return lax.index_in_dim(rows[place[0]], place[1], keepdims=False)
 
     outputs = []
-    values = written.compile(XLA(read, (batch,)))
-    for scalars, aval in zip(values, written.out_avals, strict=True):
+    values = program.compile(XLA(read, (batch,)))
+    for scalars, aval in zip(values, program.out_avals, strict=True):
         lanes = [x if np.ndim(x) else lax.broadcast(x, (batch,)) for x in scalars]
         # [entries, N] here, and the batch comes first in the result, as ``jax.vmap`` wants it.
-        stacked = jnp.stack(lanes) if lanes else jnp.zeros((0, batch), aval.dtype)
-        outputs.append(jnp.moveaxis(stacked.reshape((*aval.shape, batch)), -1, 0))
-    return jax.tree.unflatten(written.out_tree, outputs)
+        batch_leaf = jnp.stack(lanes) if lanes else jnp.zeros((0, batch), aval.dtype)
+        outputs.append(jnp.moveaxis(batch_leaf.reshape((*aval.shape, batch)), -1, 0))
+    return jax.tree.unflatten(program.out_tree, outputs)
 
 
 Values = dict[Node, Any]
@@ -111,14 +111,14 @@ Values = dict[Node, Any]
 class XLA(Backend[Any]):
     """Emits JAX operations; a value is a lane, a value that all lanes share, or a constant."""
 
-    def __init__(self, read: Callable[[tuple[int, int]], Any], batch_shape: tuple[int, ...]):
+    def __init__(self, read_input: Callable[[tuple[int, int]], Any], batch_shape: tuple[int, ...]):
         """Says where the program runs.
 
         Args:
-          read: returns the lane of an input from (number of the argument, position in it).
+          read_input: returns the lane of an input from (number of the argument, position in it).
           batch_shape: the shape of one lane.
         """
-        self._read = read
+        self._read = read_input
         self._batch_shape = batch_shape
 
     def constant(self, number: Any) -> Any:
@@ -132,9 +132,9 @@ class XLA(Backend[Any]):
     def node(self, node: Node, operands: list[Any]) -> Any:
         """Emits one operation."""
         op = cast(Op, node.op)  # leaves are not scheduled
-        mixes = op.name != "select_n"  # alone in taking no NumPy scalars beside lanes
+        is_mixed = op.name != "select_n"  # alone in taking no NumPy scalars beside lanes
         values = [
-            value if is_constant(arg) and mixes else self._spread(value, node.varying)
+            value if is_constant(arg) and is_mixed else self._spread(value, node.varying)
             for arg, value in zip(node.args, operands, strict=True)
         ]
         return operation(op.name)(*values, **dict(op.params))
@@ -144,14 +144,14 @@ class XLA(Backend[Any]):
         predicate = self._any_of(self.value(gate.predicate, values))
         # Reading a leaf adds it to the values. With a copy, the branch reads its own and captures
         # none of these.
-        outside = dict(values)
-        cold = [self._materialize(out.cold, out.leaf.varying, outside) for out in gate.outs]
+        scope = dict(values)
+        cold_values = [self._materialize(out.cold, out.leaf.varying, scope) for out in gate.outs]
 
         def hot() -> list[Any]:
-            inner = self.inside(gate.body, values)
-            return [self._materialize(out.hot, out.leaf.varying, inner) for out in gate.outs]
+            inner_values = self.inside(gate.body, values)
+            return [self._materialize(out.hot, out.leaf.varying, inner_values) for out in gate.outs]
 
-        return lax.cond(predicate, hot, lambda: cold)
+        return lax.cond(predicate, hot, lambda: cold_values)
 
     def loop(self, loop: LiveLoop, values: Values) -> list[Any]:
         """Emits a ``fori_loop``, a ``scan`` or a ``while_loop``."""
@@ -164,9 +164,9 @@ class XLA(Backend[Any]):
                 jax.numpy.stack([self._materialize(x, e.leaf.varying, values) for x in e.values])
                 for e in loop.elements
             ]
-            final, stacked = lax.scan(body, init, rows, length=loop.length)
-            records = zip(loop.records, stacked, strict=True)
-            return [*final, *(row[t] for record, row in records for t in range(len(record.outs)))]
+            state, stacks = lax.scan(body, init, rows, length=loop.length)
+            records = zip(loop.records, stacks, strict=True)
+            return [*state, *(row[t] for record, row in records for t in range(len(record.outs)))]
         return self._repeat(loop, body, init)
 
     def _iteration(
@@ -175,9 +175,9 @@ class XLA(Backend[Any]):
         """Emits a loop's body; returns the next carry and what is kept."""
         leaves = dict(zip((c.leaf for c in loop.carries), carry, strict=True))
         leaves.update(zip((e.leaf for e in loop.elements), row, strict=True))
-        inner = self.inside(loop.body, values, leaves)
-        nexts = [self._materialize(c.next, c.out.varying, inner) for c in loop.carries]
-        return nexts, [self.value(record.value, inner) for record in loop.records]
+        inner_values = self.inside(loop.body, values, leaves)
+        next_values = [self._materialize(c.next, c.out.varying, inner_values) for c in loop.carries]
+        return next_values, [self.value(record.value, inner_values) for record in loop.records]
 
     def _repeat(self, loop: LiveLoop, body: Callable, init: list[Any]) -> list[Any]:
         """Emits a loop that reads no elements and keeps no records."""

@@ -37,14 +37,14 @@ class Formulas:
         if is_constant(scalar):
             return self._numbered(("constant", scalar.dtype.name))
         # With a stack of its own: a formula may be nested deeper than Python's calls.
-        waiting = [scalar]
-        while waiting:
-            node = waiting.pop()
+        stack = [scalar]
+        while stack:
+            node = stack.pop()
             # What is in memory is told by its place, whatever it was computed from.
             args = () if self._is_stored(node) else node.args
-            missing = [x for x in args if isinstance(x, Node) and x not in self._number_of]
-            if missing:
-                waiting += [node, *missing]
+            operands = [x for x in args if isinstance(x, Node) and x not in self._number_of]
+            if operands:
+                stack += [node, *operands]
             elif node not in self._number_of:
                 self._number_of[node] = self._numbered(self._key(node))
         return self._number_of[scalar]
@@ -65,19 +65,19 @@ class Formulas:
         return self._numbers.setdefault(key, len(self._numbers))
 
 
-def sum_terms(node: Node, uses: Counter[Node]) -> list[Scalar]:
+def sum_terms(node: Node, num_reads: Counter[Node]) -> list[Scalar]:
     """Returns what a node adds up, in order, where nothing else reads the sums between.
 
     Args:
       node: the sum, or another operation that may be grouped in any way.
-      uses: how often each node is read.
+      num_reads: how often each node is read.
     """
-    waiting = list(node.args)
+    stack = list(node.args)
     terms = []
-    while waiting:
-        x = waiting.pop()
-        if isinstance(x, Node) and x.op == node.op and uses[x] == 1:
-            waiting += x.args
+    while stack:
+        x = stack.pop()
+        if isinstance(x, Node) and x.op == node.op and num_reads[x] == 1:
+            stack += x.args
         else:
             terms.append(x)
     return terms[::-1]  # the stack gave the last first

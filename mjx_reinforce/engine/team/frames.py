@@ -12,21 +12,21 @@ class Frame(NamedTuple):
     """A place in the frame of a link.
 
     link: -1 is the world
-    at: [3] (m)
+    pos: [3] (m)
     quat: [4]
     """
 
     link: int
-    at: np.ndarray
+    pos: np.ndarray
     quat: np.ndarray
 
-    def place(self, at: Any) -> np.ndarray:
+    def place(self, pos: Any) -> np.ndarray:
         """Returns a point [3] of this frame in the link's."""
-        return self.at + rotation(self.quat) @ np.asarray(at)
+        return self.pos + rotation(self.quat) @ np.asarray(pos)
 
-    def then(self, at: Any, quat: Any) -> "Frame":
+    def then(self, pos: Any, quat: Any) -> "Frame":
         """Returns a frame that has this pose in this one."""
-        return Frame(self.link, self.place(at), times(self.quat, quat))
+        return Frame(self.link, self.place(pos), times(self.quat, quat))
 
 
 class Inertial(NamedTuple):

@@ -66,9 +66,9 @@ def packed(low: int, high: int) -> int:
     return low | high << 16
 
 
-def packed_item(first: int, second: int, part: int) -> int:
+def packed_item(geom1: int, geom2: int, part: int) -> int:
     """Returns the Item of ``device/records.h``."""
-    return first | second << GEOM_BITS | part << 2 * GEOM_BITS
+    return geom1 | geom2 << GEOM_BITS | part << 2 * GEOM_BITS
 
 
 def checks() -> list[str]:
@@ -79,9 +79,9 @@ def checks() -> list[str]:
         f"{item}.first() == 0xabc && {item}.second() == 0xdef && {item}.part() == 5",
         f"{pair}.low() == 0xabcd && {pair}.high() == 0x7654",
     ]
-    for struct, fields in FIELDS.items():
+    for struct, field_sizes in FIELDS.items():
         offset = 0
-        for field, count in fields.items():
+        for field, count in field_sizes.items():
             conditions.append(f"__builtin_offsetof({struct}, {field}) == {offset} * sizeof(real)")
             offset += count
         conditions.append(f"sizeof({struct}) == {offset} * sizeof(real)")

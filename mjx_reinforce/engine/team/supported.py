@@ -39,22 +39,22 @@ NUM_PARTS = {
 class GeomPair(NamedTuple):
     """Two geoms that may meet.
 
-    first: the number of the flatter one
-    second: that of the other one
+    geom1: the number of the flatter one
+    geom2: that of the other one
     pair: the number of the pair that the model names; -1 where it names none
     """
 
-    first: int
-    second: int
+    geom1: int
+    geom2: int
     pair: int
 
 
 def why(mj_model: MjModel) -> str | None:
     """Returns in one line why teams cannot play a model, or None if they can."""
     model: Any = mj_model
-    for lacking in (_lacking_options, _lacking_parts, _lacking_actuators, _lacking_contacts):
-        for feature, present in lacking(model):
-            if present:
+    for features in (_lacking_options, _lacking_parts, _lacking_actuators, _lacking_contacts):
+        for feature, has_feature in features(model):
+            if has_feature:
                 return f"the model has {feature}, which teams of lanes do not play"
     return None
 
@@ -62,12 +62,12 @@ def why(mj_model: MjModel) -> str | None:
 def _lacking_options(model: Any) -> Iterable[tuple[str, Any]]:
     """Yields what of a model's options the device code lacks, and whether the model has it."""
     opt = model.opt
-    kinds = _C.mjtIntegrator
-    integrators = (kinds.mjINT_EULER, kinds.mjINT_RK4, kinds.mjINT_IMPLICITFAST)
+    types = _C.mjtIntegrator
+    integrators = (types.mjINT_EULER, types.mjINT_RK4, types.mjINT_IMPLICITFAST)
     yield "an integrator other than Euler, RK4 and implicitfast", opt.integrator not in integrators
     yield "a solver other than Newton", opt.solver != _C.mjtSolver.mjSOL_NEWTON
-    few = f"few iterations of its solver ({opt.iterations}, {opt.ls_iterations} along a line)"
-    yield few, stops_early(model)
+    limits = f"few iterations of its solver ({opt.iterations}, {opt.ls_iterations} along a line)"
+    yield limits, stops_early(model)
     yield "elliptic friction cones", opt.cone != _C.mjtCone.mjCONE_PYRAMIDAL
     flags = opt.disableflags | opt.enableflags | opt.disableactuator
     yield "flags that disable or enable parts of the physics", flags
@@ -77,7 +77,7 @@ def _lacking_options(model: Any) -> Iterable[tuple[str, Any]]:
 
 def _lacking_parts(model: Any) -> Iterable[tuple[str, Any]]:
     """Yields what of bodies and constraints the device code lacks, and whether a model has it."""
-    hinged = np.isin(model.jnt_type, (HINGE, SLIDE))
+    is_scalar = np.isin(model.jnt_type, (HINGE, SLIDE))
     yield "no joints", not model.njnt
     yield f"more than {MAX_DOFS} degrees of freedom", model.nv > MAX_DOFS
     yield f"{_MAX_GEOMS} geoms or more", model.ngeom >= _MAX_GEOMS
@@ -95,13 +95,13 @@ def _lacking_parts(model: Any) -> Iterable[tuple[str, Any]]:
     yield "tendons that push", any(np.any(x) for x in tendons)
     polynomials = (model.jnt_stiffnesspoly, model.dof_dampingpoly, model.jnt_springyield)
     yield "polynomial springs or damping", any(np.any(x) for x in polynomials)
-    yield "springs of free or ball joints", np.any(model.jnt_stiffness[~hinged])
-    yield "limits of ball joints", np.any(model.jnt_limited[~hinged])
+    yield "springs of free or ball joints", np.any(model.jnt_stiffness[~is_scalar])
+    yield "limits of ball joints", np.any(model.jnt_limited[~is_scalar])
     # MuJoCo integrates such bodies in a way of its own.
-    alone = np.bincount(model.dof_treeid, minlength=1) == 6
-    free = model.jnt_dofadr[model.jnt_type == FREE]
-    fast = model.opt.integrator == _C.mjtIntegrator.mjINT_IMPLICITFAST
-    yield "lone free bodies under implicitfast", fast and np.any(alone[model.dof_treeid[free]])
+    is_lone = np.bincount(model.dof_treeid, minlength=1) == 6
+    dofs = model.jnt_dofadr[model.jnt_type == FREE]
+    is_fast = model.opt.integrator == _C.mjtIntegrator.mjINT_IMPLICITFAST
+    yield "lone free bodies under implicitfast", is_fast and np.any(is_lone[model.dof_treeid[dofs]])
     active = model.eq_type[np.asarray(model.eq_active0, bool)]
     equalities = (_C.mjtEq.mjEQ_CONNECT, _C.mjtEq.mjEQ_JOINT)
     yield "equalities other than connect and joint", not np.isin(active, equalities).all()
@@ -109,11 +109,11 @@ def _lacking_parts(model: Any) -> Iterable[tuple[str, Any]]:
 
 def _lacking_actuators(model: Any) -> Iterable[tuple[str, Any]]:
     """Yields what of actuators the device code lacks, and whether a model has it."""
-    of_joints = model.actuator_trntype == _C.mjtTrn.mjTRN_JOINT
-    yield "actuators of anything but joints", not of_joints.all()
-    joints = model.actuator_trnid[of_joints, 0]
-    hinged = np.isin(model.jnt_type[joints], (HINGE, SLIDE))
-    yield "actuators of free or ball joints", not hinged.all()
+    is_of_joint = model.actuator_trntype == _C.mjtTrn.mjTRN_JOINT
+    yield "actuators of anything but joints", not is_of_joint.all()
+    joints = model.actuator_trnid[is_of_joint, 0]
+    is_scalar = np.isin(model.jnt_type[joints], (HINGE, SLIDE))
+    yield "actuators of free or ball joints", not is_scalar.all()
     gains = np.isin(model.actuator_gaintype, (_C.mjtGain.mjGAIN_FIXED, _C.mjtGain.mjGAIN_AFFINE))
     biases = np.isin(model.actuator_biastype, (_C.mjtBias.mjBIAS_NONE, _C.mjtBias.mjBIAS_AFFINE))
     yield "gains or biases other than fixed and affine", not (gains.all() and biases.all())
@@ -126,13 +126,13 @@ def _lacking_actuators(model: Any) -> Iterable[tuple[str, Any]]:
 
 def _lacking_contacts(model: Any) -> Iterable[tuple[str, Any]]:
     """Yields what of contacts the device code lacks, and whether a model has it."""
-    sticks = (model.geom_adhesion, model.geom_surfacevel, model.pair_adhesion)
-    yield "adhesion or moving surfaces", any(np.any(x) for x in sticks)
+    adhesions = (model.geom_adhesion, model.geom_surfacevel, model.pair_adhesion)
+    yield "adhesion or moving surfaces", any(np.any(x) for x in adhesions)
     num_items = 0
     for pair in meeting(model):
         kinds = geom_kinds(model, pair)
-        names = [_C.mjtGeom(x).name.removeprefix("mjGEOM_").lower() for x in kinds]
-        yield f"a {names[1]} that meets a {names[0]}", kinds not in NUM_PARTS
+        geom_names = [_C.mjtGeom(x).name.removeprefix("mjGEOM_").lower() for x in kinds]
+        yield f"a {geom_names[1]} that meets a {geom_names[0]}", kinds not in NUM_PARTS
         # A kind that is lacking does not get here: ``why`` stops at the first one.
         num_items += NUM_PARTS[kinds]
     yield f"more than {_MAX_ITEMS} possible contacts", num_items > _MAX_ITEMS
@@ -140,14 +140,14 @@ def _lacking_contacts(model: Any) -> Iterable[tuple[str, Any]]:
 
 def geom_kinds(model: Any, pair: GeomPair) -> tuple[int, int]:
     """Returns MuJoCo's types of two geoms."""
-    return int(model.geom_type[pair.first]), int(model.geom_type[pair.second])
+    return int(model.geom_type[pair.geom1]), int(model.geom_type[pair.geom2])
 
 
 def meeting(model: Any) -> list[GeomPair]:
     """Returns the pairs of geoms that may meet, the flatter first; those of C's choice lead."""
-    numbered = ((int(pair), *sorted((int(g), int(h)))) for g, h, pair in geom_pairs(model))
+    pair_keys = ((int(pair), *sorted((int(g), int(h)))) for g, h, pair in geom_pairs(model))
     pairs = []
-    for pair, *geoms in sorted(numbered):
-        flatter, rounder = sorted(geoms, key=model.geom_type.__getitem__)
-        pairs.append(GeomPair(flatter, rounder, pair))
+    for pair, *geoms in sorted(pair_keys):
+        flat_geom, round_geom = sorted(geoms, key=model.geom_type.__getitem__)
+        pairs.append(GeomPair(flat_geom, round_geom, pair))
     return pairs

@@ -21,8 +21,8 @@ from mjx_reinforce.engine.team.supported import BALL, BOX, CAPSULE, FREE, HINGE,
 
 _C: Any = mujoco  # a C extension without stubs
 #: The files of the device code, each after those that it uses. What the tables use is before them.
-_BEFORE = ["lanes", "records"]
-_FILES = [
+_PRELUDE = ["lanes", "records"]
+_HEADERS = [
     "algebra",
     "state",
     "block",
@@ -43,11 +43,11 @@ _FILES = [
     "launch",
 ]
 #: Contacts that the state of a team has room for; more go to memory.
-NEAR = 8
+NUM_NEAR = 8
 #: How a degree of freedom moves what it carries, by ``device/kinematics.h``.
 _TURNS, _SHIFTS, _SHIFTS_IN_THE_WORLD = range(3)
 #: MuJoCo's mjMINVAL, mjMINIMP and mjMAXIMP.
-_TINY = 1e-15
+_MIN_VALUE = 1e-15
 _MIN_IMPEDANCE = 1e-4
 _MAX_IMPEDANCE = 1 - 1e-4
 _NO_LIMIT = 1e30
@@ -68,12 +68,12 @@ class _ContactKind(NamedTuple):
     soft: int
 
 
-def physics_text(mj_model: MjModel, near: int = NEAR) -> str:
+def physics_text(mj_model: MjModel, num_near: int = NUM_NEAR) -> str:
     """Returns the device code for a model.
 
     Args:
       mj_model: the model.
-      near: contacts that the state of a team has room for.
+      num_near: contacts that the state of a team has room for.
 
     Raises:
       UnsupportedPrimitive: the device code lacks something that the model has; see ``why``.
@@ -81,17 +81,18 @@ def physics_text(mj_model: MjModel, near: int = NEAR) -> str:
     if reason := why(mj_model):
         raise UnsupportedPrimitive(reason)
     device = Path(__file__).parent / "device"
-    before, after = (
-        [(device / f"{name}.h").read_text("utf-8") for name in names] for names in (_BEFORE, _FILES)
+    prelude, headers = (
+        [(device / f"{name}.h").read_text("utf-8") for name in names]
+        for names in (_PRELUDE, _HEADERS)
     )
     # One text, as NVRTC has no folders: nothing is included, and no file may come twice.
-    text = "\n".join([*before, _Tables(mj_model, near).text(), *after])
+    text = "\n".join([*prelude, _Tables(mj_model, num_near).text(), *headers])
     return text.replace("#pragma once\n", "")
 
 
-def far_words(mj_model: MjModel, near: int = NEAR) -> int:
+def far_words(mj_model: MjModel, num_near: int = NUM_NEAR) -> int:
     """Returns how many 4-byte words of memory the contacts need that a team has no room for."""
-    sizes = _Tables(mj_model, near).constants
+    sizes = _Tables(mj_model, num_near).constants
     contact_words = 13 + 5 * sizes["CD"]  # the Contact of state.h
     words = max(0, int(sizes["NI"] - sizes["NEAR"])) * int(contact_words)
     return words + words % 2  # numbers of 8 bytes may follow
@@ -106,7 +107,7 @@ class _Tables:
     soft: the rows of the softnesses that were met, with their numbers
     """
 
-    def __init__(self, mj_model: MjModel, near: int):
+    def __init__(self, mj_model: MjModel, num_near: int):
         """Makes them; see ``physics_text``."""
         model: Any = mj_model
         self.model = model
@@ -122,7 +123,7 @@ class _Tables:
         self._dofs()
         self._actuators()
         self._equalities()
-        self._pairs(near)
+        self._pairs(num_near)
         self._jumps()
         self.constants["NQ"] = model.nq
         self.constants["NV"] = model.nv
@@ -141,9 +142,9 @@ class _Tables:
         mask = "unsigned long long" if self.model.nv > 32 else "unsigned"
         lines.append(f"typedef {mask} Mask;")
         for name, values in self.functions.items():
-            numbers = ", ".join(str(int(x)) for x in values) or "0"
+            table = ", ".join(str(int(x)) for x in values) or "0"
             lines.append(f"DEV constexpr int {name}(int i) {{")
-            lines.append(f"  constexpr int table[] = {{{numbers}}};\n  return table[i];\n}}")
+            lines.append(f"  constexpr int table[] = {{{table}}};\n  return table[i];\n}}")
         lines.append("struct Model {")
         lines.append("  real timestep, smallest_gain;")
         # In float32 a step that lowers the cost by less is rounding; in float64 the search goes on
@@ -153,17 +154,17 @@ class _Tables:
             f"real({float(self.model.opt.timestep)!r})",
             f"SINGLE ? real({float(gain)!r}) : real(0)",
         ]
-        for type_name, literal, fields in (
+        for type_name, literal, arrays in (
             ("int", lambda x: f"{int(x):d}", self.ints),
             ("Mask", lambda x: f"{int(x):d}ull", self.masks),
             ("real", lambda x: f"real({float(x)!r})", self.reals),
         ):
-            for name, values in fields.items():
-                flat = np.asarray(values).ravel().tolist() or [0]  # C++ has no empty array
+            for name, values in arrays.items():
+                entries = np.asarray(values).ravel().tolist() or [0]  # C++ has no empty array
                 struct = records.STRUCTS.get(name, type_name)
-                numbers = records.size(struct)
-                lines.append(f"  {struct} {name}[{-(-len(flat) // numbers)}];")
-                initial_values.append("{" + ",".join(map(literal, flat)) + "}")
+                row_size = records.size(struct)
+                lines.append(f"  {struct} {name}[{-(-len(entries) // row_size)}];")
+                initial_values.append("{" + ",".join(map(literal, entries)) + "}")
         lines.append("};")
         lines += records.checks()
         lines.append("#define MODEL_INIT {" + ",\\\n".join(initial_values) + "}")
@@ -174,14 +175,14 @@ class _Tables:
         opt = self.model.opt
         if opt.integrator == _C.mjtIntegrator.mjINT_IMPLICITFAST:
             return 2
-        euler = opt.integrator == _C.mjtIntegrator.mjINT_EULER
-        return int(euler and self.model.dof_damping.any())
+        is_euler = opt.integrator == _C.mjtIntegrator.mjINT_EULER
+        return int(is_euler and self.model.dof_damping.any())
 
     def _records(self, name: str, order: Any = slice(None), **columns: np.ndarray) -> None:
         """Makes a table of structs from the columns of their fields, [rows] or [rows, numbers]."""
-        fields = records.FIELDS[records.STRUCTS[name]]
-        assert {*columns} == {*fields}
-        rows = [columns[field].reshape(-1, count) for field, count in fields.items()]
+        field_sizes = records.FIELDS[records.STRUCTS[name]]
+        assert {*columns} == {*field_sizes}
+        rows = [columns[field].reshape(-1, count) for field, count in field_sizes.items()]
         self.reals[name] = np.hstack(rows)[order]
 
     def _link_number(self, link: int) -> int:
@@ -191,8 +192,8 @@ class _Tables:
     def _links(self) -> None:
         """Makes the tables of links, and finds the frames of bodies."""
         model = self.model
-        no_turn = np.eye(4)[0]
-        self.frames = [Frame(-1, np.zeros(3), no_turn)]
+        identity = np.eye(4)[0]
+        self.frames = [Frame(-1, np.zeros(3), identity)]
         self.parents = []
         rows = []
         for body in range(1, model.nbody):
@@ -210,27 +211,27 @@ class _Tables:
                     parent_link = -1
                 # The pose is linear in these two: for a hinge at angle q, the quaternion is
                 # cos(q/2) quat + sin(q/2) turned; for a slide, the place is at + q turned.
-                turned = times(frame.quat, [0, *axis])
+                axis_quat = times(frame.quat, [0, *axis])
                 if kind == SLIDE:
-                    turned = [*(rotation(frame.quat) @ axis), 0]
-                zero = 0
+                    axis_quat = [*(rotation(frame.quat) @ axis), 0]
+                zero_qpos = 0
                 if kind in (HINGE, SLIDE):
-                    zero = model.qpos0[model.jnt_qposadr[joint]]
-                rows.append((frame.place(anchor), frame.quat, turned, zero))
+                    zero_qpos = model.qpos0[model.jnt_qposadr[joint]]
+                rows.append((frame.place(anchor), frame.quat, axis_quat, zero_qpos))
                 self.parents.append(parent_link)
-                frame = Frame(joint, -np.asarray(anchor), no_turn)
+                frame = Frame(joint, -np.asarray(anchor), identity)
             self.frames.append(frame)
-        kinds = model.jnt_type
-        names = ("link_at", "link_quat", "link_turned", "link_zero")
-        self.reals |= zip(names, zip(*rows, strict=True), strict=True)
-        self.ints["link_kind"] = kinds
+        joint_kinds = model.jnt_type
+        columns = ("link_at", "link_quat", "link_turned", "link_zero")
+        self.reals |= zip(columns, zip(*rows, strict=True), strict=True)
+        self.ints["link_kind"] = joint_kinds
         self.ints["link_qpos"] = model.jnt_qposadr
         self.ints["link_dof"] = model.jnt_dofadr
         self.functions["link_parent"] = self.parents
         self.functions["has_children"] = [int(x in self.parents) for x in range(model.njnt)]
-        rotating = np.flatnonzero(kinds <= BALL)
-        self.ints["turn_dof"] = model.jnt_dofadr[rotating] + 3 * (kinds[rotating] == FREE)
-        self.constants["NTURN"] = len(rotating)
+        joints = np.flatnonzero(joint_kinds <= BALL)
+        self.ints["turn_dof"] = model.jnt_dofadr[joints] + 3 * (joint_kinds[joints] == FREE)
+        self.constants["NTURN"] = len(joints)
 
     def _bodies(self) -> None:
         """Makes the tables of bodies, and of the inertias of links."""
@@ -239,25 +240,25 @@ class _Tables:
         for body in range(model.nbody):
             frame = self.frames[body].then(model.body_ipos[body], model.body_iquat[body])
             turn = rotation(frame.quat)
-            bodies.append(Inertial(frame.at, turn @ np.diag(model.body_inertia[body]) @ turn.T))
+            bodies.append(Inertial(frame.pos, turn @ np.diag(model.body_inertia[body]) @ turn.T))
         self.ints["body_link"] = [self._link_number(x.link) for x in self.frames]
         self.ints["body_root"] = model.body_rootid
-        self.reals["body_at"] = [x.at for x in self.frames]
+        self.reals["body_at"] = [x.pos for x in self.frames]
         self.reals["body_com"] = [x.com for x in bodies]
         self.reals["body_inertia"] = [six(x.inertia) for x in bodies]
         self.reals["body_mass"] = model.body_mass
         masses = []
         links = []
         for link in range(model.njnt):
-            carried = [x for x in range(model.nbody) if self.frames[x].link == link]
-            mass = sum(model.body_mass[x] for x in carried)
+            link_bodies = [x for x in range(model.nbody) if self.frames[x].link == link]
+            mass = sum(model.body_mass[x] for x in link_bodies)
             # A link may carry nothing: that of the first of two hinges of one body.
             com = np.zeros(3)
-            if carried and mass != 0:
-                weighted = (model.body_mass[x] * bodies[x].com for x in carried)
-                com = sum(weighted, start=np.zeros(3)) / max(mass, _TINY)
+            if link_bodies and mass != 0:
+                mass_moments = (model.body_mass[x] * bodies[x].com for x in link_bodies)
+                com = sum(mass_moments, start=np.zeros(3)) / max(mass, _MIN_VALUE)
             inertia = np.zeros((3, 3))
-            for x in carried:  # the parallel axis theorem
+            for x in link_bodies:  # the parallel axis theorem
                 arm = bodies[x].com - com
                 shift = arm @ arm * np.eye(3) - np.outer(arm, arm)
                 inertia += bodies[x].inertia + model.body_mass[x] * shift
@@ -272,19 +273,19 @@ class _Tables:
         model = self.model
         joint = self.dof_joint
         joint_kind = model.jnt_type[joint]
-        within = np.arange(model.nv) - model.jnt_dofadr[joint]
+        axis_index = np.arange(model.nv) - model.jnt_dofadr[joint]
         is_single = joint_kind >= SLIDE
         # A ball or a free joint moves along the axes of its own frame.
-        axes = np.where(is_single[:, None], model.jnt_axis[joint], np.eye(3)[within % 3])
-        kinds = np.full(model.nv, _TURNS)
-        kinds[joint_kind == SLIDE] = _SHIFTS
+        axes = np.where(is_single[:, None], model.jnt_axis[joint], np.eye(3)[axis_index % 3])
+        dof_kinds = np.full(model.nv, _TURNS)
+        dof_kinds[joint_kind == SLIDE] = _SHIFTS
         # A free joint shifts by the axes of the world, and turns about those of the body.
-        kinds[(joint_kind == FREE) & (within < 3)] = _SHIFTS_IN_THE_WORLD
+        dof_kinds[(joint_kind == FREE) & (axis_index < 3)] = _SHIFTS_IN_THE_WORLD
         qpos = model.jnt_qposadr[joint]
         self.ints["dof_link"] = joint
-        self.ints["dof_kind"] = kinds
+        self.ints["dof_kind"] = dof_kinds
         self.ints["dof_qpos"] = qpos
-        self.ints["dof_turns"] = ~is_single & ~(kinds == _SHIFTS_IN_THE_WORLD)
+        self.ints["dof_turns"] = ~is_single & ~(dof_kinds == _SHIFTS_IN_THE_WORLD)
         self.reals["dof_axis"] = axes
         self.reals["dof_damping"] = model.dof_damping
         self.reals["dof_armature"] = model.dof_armature
@@ -293,41 +294,41 @@ class _Tables:
         self.reals["dof_zero"] = model.qpos0[qpos]
         self.functions["dof_parent"] = model.dof_parentid
         self.functions["last_of_link"] = np.where(np.diff(joint, append=-1), joint, -1)
-        self._chains(kinds)
+        self._chains(dof_kinds)
         self._bounds(is_single)
 
-    def _chains(self, kinds: np.ndarray) -> None:
+    def _chains(self, dof_kinds: np.ndarray) -> None:
         """Makes the tables of which degrees of freedom move a link, and which meet in M."""
         model = self.model
-        movers = [[] for _ in range(model.njnt + 1)]  # none moves the world, the last
-        paired = []
+        link_chains = [[] for _ in range(model.njnt + 1)]  # none moves the world, the last
+        dof_pairs = []
         for i in range(model.nv):
             chain = []
             j = i
             while j >= 0:
                 chain.append(j)
                 # The three shifts of a free body are orthogonal: their entries of M are zero.
-                both_shift = kinds[i] == kinds[j] == _SHIFTS_IN_THE_WORLD
-                if j < i and not both_shift:
-                    paired.append(records.packed(j, i))
+                is_shift_pair = dof_kinds[i] == dof_kinds[j] == _SHIFTS_IN_THE_WORLD
+                if j < i and not is_shift_pair:
+                    dof_pairs.append(records.packed(j, i))
                 j = model.dof_parentid[j]
             # The last degree of freedom of a link has the longest chain, and overwrites the others.
-            movers[self.dof_joint[i]] = chain
-        self.ints["paired"] = paired
-        self.constants["NPAIRED"] = len(paired)
-        self.masks["link_dofs"] = [sum(1 << x for x in chain) for chain in movers]
+            link_chains[self.dof_joint[i]] = chain
+        self.ints["paired"] = dof_pairs
+        self.constants["NPAIRED"] = len(dof_pairs)
+        self.masks["link_dofs"] = [sum(1 << x for x in chain) for chain in link_chains]
 
     def _bounds(self, is_single: np.ndarray) -> None:
         """Makes the tables of limits and friction loss."""
         model = self.model
         joint = self.dof_joint
-        limited = np.asarray(model.jnt_limited, bool)[joint] & is_single
+        is_limited = np.asarray(model.jnt_limited, bool)[joint] & is_single
         span = np.diff(model.jnt_range[joint]).ravel()
         # Both limits of a joint push at once only where their margins overlap.
-        overlap = limited & (span < 2 * model.jnt_margin[joint])
-        self.constants["LIMITS"] = int(limited.any()) + int(overlap.any())
+        overlap = is_limited & (span < 2 * model.jnt_margin[joint])
+        self.constants["LIMITS"] = int(is_limited.any()) + int(overlap.any())
         self.constants["LOSSES"] = int(np.any(model.dof_frictionloss))
-        self.ints["dof_limited"] = limited
+        self.ints["dof_limited"] = is_limited
         self._records(
             "dof_limit",
             range=model.jnt_range[joint],
@@ -335,16 +336,16 @@ class _Tables:
             weight=model.dof_invweight0,
         )
         self.ints["dof_limit_soft"] = self._softs(
-            model.jnt_solref[joint], model.jnt_solimp[joint], limited
+            model.jnt_solref[joint], model.jnt_solimp[joint], is_limited
         )
         self._records("dof_loss", most=model.dof_frictionloss, weight=model.dof_invweight0)
         self.ints["dof_loss_soft"] = self._softs(
             model.dof_solref, model.dof_solimp, model.dof_frictionloss
         )
 
-    def _softs(self, solrefs: np.ndarray, solimps: np.ndarray, present: np.ndarray) -> list[int]:
+    def _softs(self, solrefs: np.ndarray, solimps: np.ndarray, row_mask: np.ndarray) -> list[int]:
         """Returns ``_soft`` of each row that is present, 0 for the others."""
-        rows = zip(solrefs, solimps, present, strict=True)
+        rows = zip(solrefs, solimps, row_mask, strict=True)
         return [self._soft(ref, imp) if is_present else 0 for ref, imp, is_present in rows]
 
     def _soft(self, solref: np.ndarray, solimp: np.ndarray) -> int:
@@ -357,20 +358,20 @@ class _Tables:
             ref = np.array([0.02, 1])
         if ref[0] > 0:
             ref[0] = max(ref[0], 2 * self.model.opt.timestep)
-        least, most, middle = np.clip(imp[[0, 1, 3]], _MIN_IMPEDANCE, _MAX_IMPEDANCE)
+        dmin, dmax, midpoint = np.clip(imp[[0, 1, 3]], _MIN_IMPEDANCE, _MAX_IMPEDANCE)
         width = max(imp[2], 0)
         power = max(imp[4], 1)
         if ref[0] > 0:
-            stiffness = 1 / max(_TINY, most**2 * ref[0] ** 2 * ref[1] ** 2)
-            damping = 2 / max(_TINY, most * ref[0])
+            stiffness = 1 / max(_MIN_VALUE, dmax**2 * ref[0] ** 2 * ref[1] ** 2)
+            damping = 2 / max(_MIN_VALUE, dmax * ref[0])
         else:
-            stiffness = -ref[0] / most**2
-            damping = -ref[1] / most
-        if least == most or width <= _TINY:
+            stiffness = -ref[0] / dmax**2
+            damping = -ref[1] / dmax
+        if dmin == dmax or width <= _MIN_VALUE:
             # Without a width the impedance is the mean everywhere; 1 keeps the division sound.
-            least = most = (least + most) / 2
+            dmin = dmax = (dmin + dmax) / 2
             width = 1.0
-        softness = Softness(stiffness, damping, least, most - least, width, middle, power)
+        softness = Softness(stiffness, damping, dmin, dmax - dmin, width, midpoint, power)
         return self.soft.setdefault(Softness(*map(float, softness)), len(self.soft))
 
     def _actuators(self) -> None:
@@ -378,9 +379,9 @@ class _Tables:
         model = self.model
         dofs = model.jnt_dofadr[model.actuator_trnid[:, 0]]
         order = np.argsort(dofs, kind="stable")
-        free = (-_NO_LIMIT, _NO_LIMIT)
-        controls = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, free)
-        forces = np.where(model.actuator_forcelimited[:, None], model.actuator_forcerange, free)
+        no_range = (-_NO_LIMIT, _NO_LIMIT)
+        controls = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, no_range)
+        forces = np.where(model.actuator_forcelimited[:, None], model.actuator_forcerange, no_range)
         gain = model.actuator_gainprm[:, :3].copy()
         bias = model.actuator_biasprm[:, :3].copy()
         # All are affine here: what MuJoCo does not read of the others is zero.
@@ -405,22 +406,22 @@ class _Tables:
         # Those of a degree of freedom are from its entry up to the next one's.
         self.ints["dof_actuator"] = np.searchsorted(dofs[order], np.arange(model.nv + 1))
         joint = self.dof_joint
-        limited = model.jnt_actfrclimited[joint, None]
-        bounds = np.where(limited, model.jnt_actfrcrange[joint], free)
+        is_limited = model.jnt_actfrclimited[joint, None]
+        bounds = np.where(is_limited, model.jnt_actfrcrange[joint], no_range)
         self._records("dof_force", low=bounds[:, 0], high=bounds[:, 1])
 
     def _equalities(self) -> None:
         """Makes the tables of equality constraints."""
         model = self.model
-        kinds = np.where(model.eq_active0, model.eq_type, -1)
-        connects = np.flatnonzero(kinds == _C.mjtEq.mjEQ_CONNECT)
-        joined = np.flatnonzero(kinds == _C.mjtEq.mjEQ_JOINT)
-        self.constants["NCONNECT"] = len(connects)
-        self.constants["NE"] = 3 * len(connects) + len(joined)
+        eq_kinds = np.where(model.eq_active0, model.eq_type, -1)
+        connect_eqs = np.flatnonzero(eq_kinds == _C.mjtEq.mjEQ_CONNECT)
+        joint_eqs = np.flatnonzero(eq_kinds == _C.mjtEq.mjEQ_JOINT)
+        self.constants["NCONNECT"] = len(connect_eqs)
+        self.constants["NE"] = 3 * len(connect_eqs) + len(joint_eqs)
         links = []
         places = []
         bodies = []
-        for equality in connects:
+        for equality in connect_eqs:
             ends = (model.eq_obj1id[equality], model.eq_obj2id[equality])
             anchors = model.eq_data[equality, :6].reshape(2, 3)
             # Between sites there are no anchors in eq_data: the sites are.
@@ -435,13 +436,13 @@ class _Tables:
         self.ints["connect_body"] = bodies
         self.reals["connect_at"] = places
         self.reals["connect_weight"] = [model.body_invweight0[x, 0].sum() for x in bodies]
-        self.ints["connect_soft"] = self._equality_softs(connects)
+        self.ints["connect_soft"] = self._equality_softs(connect_eqs)
         # A joint alone is held at a value: its second is -1.
-        joints = np.stack([model.eq_obj1id[joined], model.eq_obj2id[joined]], 1)
+        joints = np.stack([model.eq_obj1id[joint_eqs], model.eq_obj2id[joint_eqs]], 1)
         dofs = np.where(joints >= 0, model.jnt_dofadr[joints], -1)
         self.ints["joined_dof"] = dofs
-        self.ints["joined_soft"] = self._equality_softs(joined)
-        self.reals["joined_poly"] = model.eq_data[joined, :5]
+        self.ints["joined_soft"] = self._equality_softs(joint_eqs)
+        self.reals["joined_poly"] = model.eq_data[joint_eqs, :5]
         self.reals["joined_weight"] = [
             sum(model.dof_invweight0[dof] for dof in pair if dof >= 0) for pair in dofs
         ]
@@ -461,9 +462,9 @@ class _Tables:
         while any(x >= 0 for x in ancestors):
             for row in range(3):
                 jumps += [
-                    records.packed(3 * link + row, 3 * far + row)
-                    for link, far in enumerate(ancestors)
-                    if far >= 0
+                    records.packed(3 * link + row, 3 * ancestor + row)
+                    for link, ancestor in enumerate(ancestors)
+                    if ancestor >= 0
                 ]
             starts.append(len(jumps))
             ancestors = [ancestors[x] if x >= 0 else -1 for x in ancestors]
@@ -471,38 +472,38 @@ class _Tables:
         self.functions["jump_start"] = starts
         self.constants["ROUNDS"] = len(starts) - 1
 
-    def _pairs(self, near: int) -> None:
+    def _pairs(self, num_near: int) -> None:
         """Makes the tables of geoms that may meet."""
         model = self.model
         pairs = [(pair, self._contact_kind(pair)) for pair in supported.meeting(model)]
-        geoms = sorted({geom for pair, _ in pairs for geom in (pair.first, pair.second)})
-        numbers = {geom: number for number, geom in enumerate(geoms)}
-        kinds: dict[_ContactKind, int] = {}
+        geoms = sorted({geom for pair, _ in pairs for geom in (pair.geom1, pair.geom2)})
+        geom_ids = {geom: number for number, geom in enumerate(geoms)}
+        kind_numbers: dict[_ContactKind, int] = {}
         items = []
         item_kinds = []
         weights = []
         for pair, contact_kind in pairs:
-            kind = kinds.setdefault(contact_kind, len(kinds))
-            bodies = model.geom_bodyid[[pair.first, pair.second]]
+            kind = kind_numbers.setdefault(contact_kind, len(kind_numbers))
+            bodies = model.geom_bodyid[[pair.geom1, pair.geom2]]
             weight = sum(model.body_invweight0[body, 0] for body in bodies)
             if contact_kind.dim > 1:
                 # Of an edge of the pyramid, which pushes along a tangent, too.
                 friction = contact_kind.friction[0]
                 weight *= 2 * friction**2 / model.opt.impratio * (1 + friction**2)
             for part in range(supported.NUM_PARTS[supported.geom_kinds(model, pair)]):
-                items.append(records.packed_item(numbers[pair.first], numbers[pair.second], part))
+                items.append(records.packed_item(geom_ids[pair.geom1], geom_ids[pair.geom2], part))
                 item_kinds.append(kind)
                 weights.append(weight)
         self.ints["item"] = items
         self.ints["item_kind"] = item_kinds
         self.reals["item_weight"] = weights
-        rows = list(kinds) or [_ContactKind(dim=1, margin=0.0, friction=(0.0,) * 5, soft=0)]
+        rows = list(kind_numbers) or [_ContactKind(dim=1, margin=0.0, friction=(0.0,) * 5, soft=0)]
         self.ints["kind_dim"] = [x.dim for x in rows]
         self.ints["kind_soft"] = [x.soft for x in rows]
         self.reals["kind_margin"] = [x.margin for x in rows]
         self.reals["kind_friction"] = [x.friction for x in rows]
         self.constants["NI"] = len(items)
-        self.constants["NEAR"] = max(1, min(near, len(items)))
+        self.constants["NEAR"] = max(1, min(num_near, len(items)))
         self.constants["CD"] = max(x.dim for x in rows)
         self.constants["NG"] = max(len(geoms), 1)
         self._geoms(np.array(geoms, int))
@@ -517,23 +518,23 @@ class _Tables:
         ]
         types = model.geom_type[geoms]
         size = model.geom_size[geoms]
-        plane = types == PLANE
-        box = types == BOX
-        radii = np.where(plane | box, 0, size[:, 0])
-        halves = np.where(types == CAPSULE, size[:, 1], 0)
-        reach = np.where(box, np.linalg.norm(size, axis=1), radii + halves)
+        is_plane = types == PLANE
+        is_box = types == BOX
+        radii = np.where(is_plane | is_box, 0, size[:, 0])
+        half_lengths = np.where(types == CAPSULE, size[:, 1], 0)
+        reach = np.where(is_box, np.linalg.norm(size, axis=1), radii + half_lengths)
         turns = [rotation(frame.quat) for frame in frames]
         # By the enum of rounds.h: a plane, what is round, a box.
-        self.ints["geom_kind"] = np.where(box, 2, ~plane)
+        self.ints["geom_kind"] = np.where(is_box, 2, ~is_plane)
         self.ints["geom_body"] = bodies
         self.ints["geom_link"] = [self._link_number(frame.link) for frame in frames]
-        self.reals["geom_at"] = [frame.at for frame in frames]
+        self.reals["geom_at"] = [frame.pos for frame in frames]
         self.reals["geom_axis"] = [turn[:, 2] for turn in turns]
         self.reals["geom_radius"] = radii
-        self.reals["geom_half"] = halves
+        self.reals["geom_half"] = half_lengths
         self.reals["geom_reach"] = reach
         # Shared memory is scarce: only boxes have a turn about the axis and three sizes.
-        has_box = box.any()
+        has_box = is_box.any()
         self.constants["HAS_BOX"] = has_box
         self.reals["geom_turn"] = []
         self.reals["geom_size"] = []
@@ -551,7 +552,7 @@ class _Tables:
                 soft=self._soft(model.pair_solref[pair.pair], model.pair_solimp[pair.pair]),
             )
         # mj_contactParam: the geom of higher priority decides alone.
-        geoms = [pair.first, pair.second]
+        geoms = [pair.geom1, pair.geom2]
         priority = model.geom_priority[geoms]
         if priority[0] != priority[1]:
             geom = geoms[priority.argmax()]
@@ -562,8 +563,8 @@ class _Tables:
         else:
             dim = model.geom_condim[geoms].max()
             friction = model.geom_friction[geoms].max(0)
-            mix = np.where(model.geom_solmix[geoms] < _TINY, 0, model.geom_solmix[geoms])
-            share = mix[0] / mix.sum() if mix.any() else 0.5
+            solmix = np.where(model.geom_solmix[geoms] < _MIN_VALUE, 0, model.geom_solmix[geoms])
+            share = solmix[0] / solmix.sum() if solmix.any() else 0.5
             refs = model.geom_solref[geoms]
             imps = model.geom_solimp[geoms]
             # Stiffness itself and a time constant do not mix: C takes the smaller numbers.

@@ -22,7 +22,7 @@ from mjx_reinforce.engine.team.formulas import Formulas, Place, sum_terms
 from mjx_reinforce.engine.team.operations import expression, literal, type_of
 
 #: Fewer scalars of one formula are computed one by one.
-_FEWEST = 4
+_MIN_RUN = 4
 #: A sum of fewer terms is not worth a meeting of the lanes.
 _SHORT_SUM = 12
 
@@ -41,13 +41,13 @@ _SUMS = {
     "add": _Sum("0", "+", "t.sum({})"),
 }
 #: What the physics reads, in the order of the operation's operands.
-_OPERANDS = ("ctrl", "time", "qpos", "qvel", "act", "qacc_warmstart")
+_INPUTS = ("ctrl", "time", "qpos", "qvel", "act", "qacc_warmstart")
 #: What it computes for the task alone, where that reads it.
-_REPORTED = ("xpos", "xipos", "cinert", "cvel", "cfrc_ext")
+_OUTPUTS = ("xpos", "xipos", "cinert", "cvel", "cfrc_ext")
 #: Where the device code has the fields of a simulation, by MuJoCo's names.
-_FIELDS = {field: f"s.{field}" for field in (*_OPERANDS, *_REPORTED, "qfrc_actuator")}
+_STATE = {field: f"s.{field}" for field in (*_INPUTS, *_OUTPUTS, "qfrc_actuator")}
 #: The operations that simulate, as the device code has them, and how often teams meet in them.
-_SIMULATES = {
+_SIMULATIONS = {
     "physics": ("const bool {}[1] = {{physics({}, M, s, {})}};", " + {} * STAGES"),
     "start": ("const bool {}[1] = {{true}}; start({}, M, s);", " + 1"),
 }
@@ -62,13 +62,13 @@ class CText(Backend[str]):
     meets: how often teams meet: in the physics outside of branches and loops, as an expression.
     """
 
-    def __init__(self, written: scalarized.Scalarized, inputs: Callable[[int], str], skip: int):
+    def __init__(self, program: scalarized.Scalarized, inputs: Callable[[int], str], steps: int):
         """Says where what is not computed here is.
 
         Args:
-          written: the program.
+          program: the program.
           inputs: the array of an argument by its number.
-          skip: physics steps of a call of "physics".
+          steps: physics steps of a call of "physics".
         """
         self.lines: list[str] = []
         self.words = 0
@@ -77,12 +77,12 @@ class CText(Backend[str]):
         self.meets = "0"
         self._depth = 0
         self._inputs = inputs
-        self._skip = skip
+        self._skip = steps
         self._values: dict[Node, str] = {}
-        self._steps = _owners(written.schedule)
-        ends = [x for leaf in written.outputs for x in leaf]
-        self._uses = liveness.reads(written.schedule, ends)
-        simulates = [x.name in _SIMULATES for x in liveness.calls(written.schedule)]
+        self._steps = _owners(program.schedule)
+        outputs = [x for leaf in program.outputs for x in leaf]
+        self._uses = liveness.reads(program.schedule, outputs)
+        simulates = [x.name in _SIMULATIONS for x in liveness.calls(program.schedule)]
         self._simulates_once = sum(simulates) == 1
         self._prepared: set[Node] = set()
         self._arrays: dict[tuple[Call, int], str] = {}
@@ -111,13 +111,13 @@ class CText(Backend[str]):
             name, start, stride = spacing
             if stride == int(len(scalars) > 1):  # side by side; that of one scalar is 0
                 return f"({name} + {start})"
-        array = self._reserve(scalars[0].dtype, len(scalars))
-        self.fill(array, scalars)
+        array_id = self._reserve(scalars[0].dtype, len(scalars))
+        self.fill(array_id, scalars)
         self.line("t.sync();")
-        self._read_from(array, scalars)
-        return array
+        self._read_from(array_id, scalars)
+        return array_id
 
-    def fill(self, array: str, scalars: Sequence[Scalar]) -> None:
+    def fill(self, array_id: str, scalars: Sequence[Scalar]) -> None:
         """Writes scalars of the program into an array."""
         self._prepare(scalars)
         # Neighbors of one formula are computed by the lanes together. All are grouped before any is
@@ -125,11 +125,11 @@ class CText(Backend[str]):
         runs = [list(run) for _, run in itertools.groupby(scalars, self._formulas.number)]
         start = 0
         for run in runs:
-            if len(run) < _FEWEST:
+            if len(run) < _MIN_RUN:
                 for k, x in enumerate(run, start=start):
-                    self.line(f"if (t.lane == 0) {array}[{k}] = {self.value(x, self._values)};")
+                    self.line(f"if (t.lane == 0) {array_id}[{k}] = {self.value(x, self._values)};")
             else:
-                self._each(run, f"{array}[{start} + i] = {{}};")
+                self._each(run, f"{array_id}[{start} + i] = {{}};")
             start += len(run)
 
     def constant(self, number: Any) -> str:
@@ -145,17 +145,17 @@ class CText(Backend[str]):
     def value(self, scalar: Scalar, values: dict[Node, str]) -> str:
         """Returns a scalar, once what it needs is written."""
         # With a stack of its own: a formula may be nested deeper than Python's calls.
-        waiting = [] if is_constant(scalar) else [scalar]
-        while waiting:
-            node = waiting.pop()
+        stack = [] if is_constant(scalar) else [scalar]
+        while stack:
+            node = stack.pop()
             if node in values:
                 continue
             if node.op is None:
                 values[node] = self.leaf(node)
             elif len(terms := self._terms(node)) >= _SHORT_SUM:
                 values[node] = self._sum(_SUMS[node.op.name], node.dtype, terms, values)
-            elif missing := [x for x in node.args if isinstance(x, Node) and x not in values]:
-                waiting += [node, *missing]
+            elif pending := [x for x in node.args if isinstance(x, Node) and x not in values]:
+                stack += [node, *pending]
             else:
                 values[node] = self.node(node, [self.value(x, values) for x in node.args])
         return super().value(scalar, values)
@@ -173,96 +173,96 @@ class CText(Backend[str]):
         groups: dict[np.dtype, list[liveness.Out]] = {}
         for out in gate.outs:
             groups.setdefault(out.leaf.dtype, []).append(out)
-        arrays = [(self._reserve(dtype, len(outs)), outs) for dtype, outs in groups.items()]
+        group_names = [(self._reserve(dtype, len(group)), group) for dtype, group in groups.items()]
         # Both sides fill the same arrays. The body is the first side's; the other side has values
         # of before.
         self.line(f"if ({self.value(gate.predicate, values)}) {{")
         with self._inside(gate.body, {}):
-            for array, outs in arrays:
-                self.fill(array, [out.hot for out in outs])
+            for array_name, group in group_names:
+                self.fill(array_name, [out.hot for out in group])
         self.line("} else {")
         with self._inside([], {}):
-            for array, outs in arrays:
-                self.fill(array, [out.cold for out in outs])
+            for array_name, group in group_names:
+                self.fill(array_name, [out.cold for out in group])
         self.lines += ["}", "t.sync();"]
         # Whichever side was taken, its results are at the same places.
-        for array, outs in arrays:
-            self._written.update({out.leaf: Place(array, k) for k, out in enumerate(outs)})
+        for array_name, group in group_names:
+            self._written.update({out.leaf: Place(array_name, k) for k, out in enumerate(group)})
         return [self.leaf(out.leaf) for out in gate.outs]
 
     def loop(self, loop: LiveLoop, values: dict[Node, str]) -> Sequence[str]:
         """Writes a loop."""
         local_values = {}
-        names = []
+        carry_names = []
         for carry in loop.carries:
             name = self.name()
             init = self.value(carry.init, values)
             self.line(f"{type_of(carry.leaf.dtype)} {name} = {init};")
-            names.append(name)
+            carry_names.append(name)
             local_values[carry.leaf] = name
         rows = [self._row(element.values, values) for element in loop.elements]
-        arrays = []
+        array_names = []
         for record in loop.records:
-            arrays.append(self.name())
-            self.line(f"{type_of(record.value.dtype)} {arrays[-1]}[{loop.length}];")
+            array_names.append(self.name())
+            self.line(f"{type_of(record.value.dtype)} {array_names[-1]}[{loop.length}];")
         count = self.name()
         conditions = []
         if loop.length is not None:
             conditions.append(f"{count} < {loop.length}")
         if loop.active is not None:
-            conditions.append(names[loop.active])
+            conditions.append(carry_names[loop.active])
         self.line(f"for (int {count} = 0; {' && '.join(conditions)}; {count}++) {{")
         for element, row in zip(loop.elements, rows, strict=True):
             local_values[element.leaf] = row(count)
         # All that is carried is computed before any of it changes: each may read the others.
-        next_names = [self.name() for _ in names]
+        next_names = [self.name() for _ in carry_names]
         with self._inside(loop.body, local_values):
-            for record, array in zip(loop.records, arrays, strict=True):
-                self.line(f"{array}[{count}] = {self.get(record.value)};")
+            for record, array_name in zip(loop.records, array_names, strict=True):
+                self.line(f"{array_name}[{count}] = {self.get(record.value)};")
             for carry, next_name in zip(loop.carries, next_names, strict=True):
                 type_name = type_of(carry.leaf.dtype)
                 self.line(f"const {type_name} {next_name} = {self.get(carry.next)};")
-        for name, next_name in zip(names, next_names, strict=True):
+        for name, next_name in zip(carry_names, next_names, strict=True):
             self.line(f"{name} = {next_name};")
         self.lines += ["t.sync();", "}"]  # the next round may write what this one reads
-        results = list(names)
-        for record, array in zip(loop.records, arrays, strict=True):
-            results += [f"{array}[{t}]" for t in range(len(record.outs))]
-        return results
+        entries = list(carry_names)
+        for record, array_name in zip(loop.records, array_names, strict=True):
+            entries += [f"{array_name}[{t}]" for t in range(len(record.outs))]
+        return entries
 
     def call(self, call: Call, values: dict[Node, str]) -> Sequence[str]:
         """Writes an operation of the device code."""
-        if call.name in _SIMULATES:
+        if call.name in _SIMULATIONS:
             self._simulate(call)
         elif call.name in ("layer", "tanh_layer"):
             self._layer(call)
         else:
             return super().call(call, values)
         arrays = enumerate(call.outs)
-        return [f"{self._arrays[call, n]}[{k}]" for n, out in arrays for k in range(len(out))]
+        return [f"{self._arrays[call, n]}[{k}]" for n, units in arrays for k in range(len(units))]
 
     def _prepare(self, scalars: Sequence[Scalar]) -> None:
         """Writes the steps, such as a call or a loop, that scalars need and that are not yet."""
-        waiting = list(scalars)
-        visited = set()
-        while waiting:
-            node = waiting.pop()
-            if not isinstance(node, Node) or node in visited or node in self._prepared:
+        stack = list(scalars)
+        nodes = set()
+        while stack:
+            node = stack.pop()
+            if not isinstance(node, Node) or node in nodes or node in self._prepared:
                 continue
-            visited.add(node)
-            waiting += node.args
+            nodes.add(node)
+            stack += node.args
             if node in self._steps and node not in self._values:
                 self._write(self._steps[node])
-        self._prepared |= visited
+        self._prepared |= nodes
 
     def _write(self, step: LiveGate | LiveLoop | Call) -> None:
         """Writes a step of the program, and before it the steps that it needs."""
         # What it reads of its own body is deeper, and is written within it.
         depth = liveness.results(step)[0].scope.depth
-        needs = [x for x in liveness.reads([step]) if x.scope.depth <= depth]
-        self._prepare(needs)
+        operands = [x for x in liveness.reads([step]) if x.scope.depth <= depth]
+        self._prepare(operands)
         if isinstance(step, LiveLoop):  # so that no round of it computes them again
-            for node in needs:
+            for node in operands:
                 self.value(node, self._values)
         self.run([step], self._values)
 
@@ -308,11 +308,11 @@ class CText(Backend[str]):
         self.words += count * size
         return name
 
-    def _read_from(self, array: str, scalars: Sequence[Scalar]) -> None:
+    def _read_from(self, array_id: str, scalars: Sequence[Scalar]) -> None:
         """Has scalars read from an array from now on."""
-        computed = {x: k for k, x in enumerate(scalars) if isinstance(x, Node) and x.op}
-        self._values.update({x: f"{array}[{k}]" for x, k in computed.items()})
-        self._written.update({x: Place(array, k) for x, k in computed.items()})
+        indices = {x: k for k, x in enumerate(scalars) if isinstance(x, Node) and x.op}
+        self._values.update({x: f"{array_id}[{k}]" for x, k in indices.items()})
+        self._written.update({x: Place(array_id, k) for x, k in indices.items()})
         self._formulas.forget()  # of what is computed from these, too
 
     def _layer(self, call: Call) -> None:
@@ -328,39 +328,39 @@ class CText(Backend[str]):
 
     def _simulate(self, call: Call) -> None:
         """Writes a call of the physics, whose state ``s`` is one for all calls of a program."""
-        names = [field.rpartition(".")[2] for field in call.fields]
-        sound = self.name()
+        field_names = [field.rpartition(".")[2] for field in call.fields]
+        is_sound = self.name()
         # Of all that the task may read, only this is a result, and not a field of the state.
-        fields = {**_FIELDS, "sound": sound}
-        for field, scalars in zip(_OPERANDS, call.args, strict=True):
+        sources = {**_STATE, "sound": is_sound}
+        for field, scalars in zip(_INPUTS, call.args, strict=True):
             if scalars:
-                self.fill(_FIELDS[field], scalars)
+                self.fill(_STATE[field], scalars)
         if self._simulates_once:
-            self._read_from(_FIELDS["ctrl"], call.args[0])  # which the physics leaves as it is
-        simulate, meets = _SIMULATES[call.name]
+            self._read_from(_STATE["ctrl"], call.args[0])  # which the physics leaves as it is
+        simulate, meetings = _SIMULATIONS[call.name]
         if self._depth:
             # In a branch or a loop other teams may not come to the meetings.
             team = "t.alone()"
         else:
             team = "t"
-            self.meets += meets.format(self._skip)
-        self.lines += ["t.sync();", simulate.format(sound, team, self._skip)]
-        for number, (name, out) in enumerate(zip(names, call.outs, strict=True)):
-            if out and name not in fields:
+            self.meets += meetings.format(self._skip)
+        self.lines += ["t.sync();", simulate.format(is_sound, team, self._skip)]
+        for result_index, (name, units) in enumerate(zip(field_names, call.outs, strict=True)):
+            if units and name not in sources:
                 raise UnsupportedPrimitive(f"the task reads {name} of the simulation")
-            array = fields.get(name, "")
-            if out and not self._simulates_once:  # another operation may overwrite it
-                array = self._reserve(out[0].dtype, len(out))
-                self.line(f"EACH(i, {len(out)}) {array}[i] = {fields[name]}[i];")
-            self._arrays[call, number] = array
-            if out and name in _REPORTED:
+            source = sources.get(name, "")
+            if units and not self._simulates_once:  # another operation may overwrite it
+                source = self._reserve(units[0].dtype, len(units))
+                self.line(f"EACH(i, {len(units)}) {source}[i] = {sources[name]}[i];")
+            self._arrays[call, result_index] = source
+            if units and name in _OUTPUTS:
                 self.reports.append(name.upper())
         self.line("t.sync();")
 
     def _row(self, row: list[Scalar], values: dict[Node, str]) -> Callable[[str], str]:
         """Returns what an element of a loop is in the iteration of a number."""
-        if spaced := self._spaced(row):
-            return spaced
+        if element := self._spaced(row):
+            return element
         name = self.name()
         entries = ", ".join(self.value(x, values) for x in row)
         self.line(f"{_qualifier(row)} {type_of(row[0].dtype)} {name}[] = {{{entries}}};")
@@ -371,8 +371,8 @@ class CText(Backend[str]):
         spacing = liveness.evenly_spaced([self._place(x) for x in row])
         if not spacing:
             return None
-        array, start, stride = spacing
-        return lambda count: f"{array}[{start} + {stride} * {count}]"
+        array_id, start, stride = spacing
+        return lambda count: f"{array_id}[{start} + {stride} * {count}]"
 
     def _terms(self, node: Node) -> list[Scalar]:
         """Returns the terms of a sum that the lanes may share; none of what is no such sum."""
@@ -388,31 +388,31 @@ class CText(Backend[str]):
         for x in terms:
             groups.setdefault(self._formulas.number(x), []).append(x)
         name = self.name()
-        total = self.name()
+        sum_name = self.name()
         self.line(f"{type_of(dtype)} {name} = {kind.start};")
         # Each lane adds up its terms of each formula, then the lanes meet; what is left is added by
         # all lanes alike.
-        alone = []
+        lone_terms = []
         for group in groups.values():
-            if len(group) < _FEWEST:
-                alone += group
+            if len(group) < _MIN_RUN:
+                lone_terms += group
             else:
                 self._each(group, f"{name} = {name} {kind.sign} {{}};")
-        parts = [kind.meet.format(name), *(self.value(x, values) for x in alone)]
-        self.line(f"const {type_of(dtype)} {total} = {f' {kind.sign} '.join(parts)};")
-        return total
+        addends = [kind.meet.format(name), *(self.value(x, values) for x in lone_terms)]
+        self.line(f"const {type_of(dtype)} {sum_name} = {f' {kind.sign} '.join(addends)};")
+        return sum_name
 
-    def _each(self, run: Sequence[Scalar], use: str) -> None:
+    def _each(self, run: Sequence[Scalar], statement: str) -> None:
         """Writes a loop in which the lanes share scalars of one formula.
 
         Args:
           run: the scalars.
-          use: a line that has one of them for its {}, and its number as ``i``.
+          statement: a line that has one of them for its {}, and its number as ``i``.
         """
         tables: list[str] = []
         body: list[str] = []
         formula = self._together(list(run), tables, body)
-        self.lines += [*tables, f"EACH(i, {len(run)}) {{", *body, use.format(formula), "}"]
+        self.lines += [*tables, f"EACH(i, {len(run)}) {{", *body, statement.format(formula), "}"]
 
     def _together(self, run: list[Scalar], tables: list[str], body: list[str]) -> str:
         """Returns scalars of one formula as an expression of their number i.
@@ -425,20 +425,20 @@ class CText(Backend[str]):
         # A column is the scalars that stand at one place of the formula, one for each i: the run is
         # the column of the whole formula, and the operands of a column's operations are columns.
         expressions: dict[tuple, str] = {}
-        waiting = [run]
-        while waiting:
-            column = waiting.pop()
+        stack = [run]
+        while stack:
+            column = stack.pop()
             key = tuple(map(identity, column))
             if key in expressions:
                 continue
-            if uniform := self._uniform(column, tables):
-                expressions[key] = uniform
+            if value := self._uniform(column, tables):
+                expressions[key] = value
                 continue
             columns = [list(x) for x in zip(*(x.args for x in column), strict=True)]
             keys = [tuple(map(identity, operand)) for operand in columns]
-            missing = [x for x, k in zip(columns, keys, strict=True) if k not in expressions]
-            if missing:
-                waiting += [column, *missing]
+            pending = [x for x, k in zip(columns, keys, strict=True) if k not in expressions]
+            if pending:
+                stack += [column, *pending]
                 continue
             example = column[0]
             name = self.name()
@@ -455,17 +455,17 @@ class CText(Backend[str]):
         name = self.name()
         if all(same(x, example) for x in column):
             # It is computed before the loop over i, once.
-            lines = self.lines
+            outer_lines = self.lines
             self.lines = tables
             value = self.value(example, self._values)
-            self.lines = lines
+            self.lines = outer_lines
             return value
-        if spaced := self._spaced(column):
-            return spaced("i")
+        if element := self._spaced(column):
+            return element("i")
         if is_constant(example):
-            numbers = ", ".join(map(literal, column))
+            literals = ", ".join(map(literal, column))
             kind = f"{_qualifier(column)} {type_of(example.dtype)}"
-            tables.append(f"{kind} {name}[] = {{{numbers}}};")
+            tables.append(f"{kind} {name}[] = {{{literals}}};")
             return f"{name}[i]"
         # Scalars of one form that are in memory are in one array: the form names it.
         places = [x for x in map(self._place, column) if x]

@@ -100,15 +100,15 @@ def advance_function(env: Environment, limit: int | None, autoreset: str) -> Cal
       autoreset: one of ``AUTORESETS``.
     """
 
-    def advance(state: VectorState, action: PyTree, begins: jax.Array) -> VectorState:
+    def advance(state: VectorState, action: PyTree, is_start: jax.Array) -> VectorState:
         """Plays a step or begins an episode; with ``same_step`` it does both where one ends."""
         if autoreset == "same_step":
-            after = _play(env, limit, state, action)
-            start = lax.cond(begins | after.done, lambda: _begin(env, state.keys), lambda: after)
+            step = _play(env, limit, state, action)
+            start = lax.cond(is_start | step.done, lambda: _begin(env, state.keys), lambda: step)
             # Reward, flags and the last observation stay those of the step that ended the episode.
-            restarted = after.replace(simulation=start.simulation, keys=start.keys)
-            return jax.tree.map(lambda x, y: jnp.where(begins, x, y), start, restarted)
-        resets = begins | (state.done if autoreset == "next_step" else False)
+            start_state = step.replace(simulation=start.simulation, keys=start.keys)
+            return jax.tree.map(lambda x, y: jnp.where(is_start, x, y), start, start_state)
+        resets = is_start | (state.done if autoreset == "next_step" else False)
         return lax.cond(
             resets, lambda: _begin(env, state.keys), lambda: _play(env, limit, state, action)
         )
@@ -120,14 +120,14 @@ def _begin(env: Environment, keys: jax.Array) -> VectorState:
     """Returns an environment at the start of its next episode, of keys as of ``VectorState``."""
     key, reset_key = jax.random.split(key_of_words(keys))
     start = env.reset(reset_key)
-    false = jnp.zeros((), bool)
+    is_done = jnp.zeros((), bool)
     zero = jnp.zeros_like(start.reward)
     return VectorState(
         simulation=start,
         reward=zero,
-        terminated=false,
-        truncated=false,
-        nonfinite=false,
+        terminated=is_done,
+        truncated=is_done,
+        nonfinite=is_done,
         final_obs=start.obs,
         metrics=dict(getattr(start, "metrics", {})),
         episode_return=zero,
@@ -138,27 +138,27 @@ def _begin(env: Environment, keys: jax.Array) -> VectorState:
 
 def _play(env: Environment, limit: int | None, state: VectorState, action: PyTree) -> VectorState:
     """Returns an environment one step later; an episode that is over begins to count again."""
-    over = state.done
-    after = env.step(state.simulation, action)
-    finite = jnp.all(jnp.isfinite(after.obs)) & jnp.isfinite(after.reward)
-    finite &= jnp.isfinite(after.done)
-    reward = jnp.where(finite, after.reward, 0)
-    length = jnp.where(over, 0, state.episode_length) + 1
+    is_over = state.done
+    simulation = env.step(state.simulation, action)
+    is_finite = jnp.all(jnp.isfinite(simulation.obs)) & jnp.isfinite(simulation.reward)
+    is_finite &= jnp.isfinite(simulation.done)
+    reward = jnp.where(is_finite, simulation.reward, 0)
+    length = jnp.where(is_over, 0, state.episode_length) + 1
     # ``done`` of a time limit of the environment's own is no termination; of the task's it is one,
     # also where that comes with the last step of ``limit``.
-    own_limit = _time_is_up(after)
+    own_limit = _time_is_up(simulation)
     truncated = own_limit
     if limit is not None:
         truncated |= length >= limit
     return VectorState(
-        simulation=after,
+        simulation=simulation,
         reward=reward,
-        terminated=((after.done != 0) & ~own_limit) | ~finite,
+        terminated=((simulation.done != 0) & ~own_limit) | ~is_finite,
         truncated=truncated,
-        nonfinite=~finite,
-        final_obs=after.obs,
-        metrics=dict(getattr(after, "metrics", {})),
-        episode_return=jnp.where(over, 0, state.episode_return) + reward,
+        nonfinite=~is_finite,
+        final_obs=simulation.obs,
+        metrics=dict(getattr(simulation, "metrics", {})),
+        episode_return=jnp.where(is_over, 0, state.episode_return) + reward,
         episode_length=length,
         keys=state.keys,
     )
@@ -177,7 +177,7 @@ def _time_is_up(state: Any) -> jax.Array:
 
 
 #: Copies of the states that a step has in memory: 4.6 of HalfCheetah, a million of them.
-_COPIES = 5
+_STATE_COPIES = 5
 
 
 class VectorEnv:
@@ -281,10 +281,10 @@ class VectorEnv:
         check_shape("the mask", where, (self.num_envs,))
         where = jnp.asarray(where, bool)
         # The others have taken a step in there, which is thrown away.
-        restarted = self._advance(state, self._null_actions(), where)
+        new_state = self._advance(state, self._null_actions(), where)
         return jax.tree.map(
-            lambda new, old: jnp.where(where.reshape(-1, *[1] * (new.ndim - 1)), new, old),
-            restarted,
+            lambda x, y: jnp.where(where.reshape(-1, *[1] * (x.ndim - 1)), x, y),
+            new_state,
             state,
         )
 
@@ -300,11 +300,11 @@ class VectorEnv:
         normal = jax.random.normal(normal_key, shape)
         # Unbounded entries are 0 to 1 here, so that nothing is computed with infinities; in the end
         # they are the normal ones.
-        bounded = np.isfinite(space.low) & np.isfinite(space.high)
-        low = np.where(bounded, space.low, 0)
-        high = np.where(bounded, space.high, 1)
-        within = jnp.asarray(low) + uniform * (high - low)
-        return jnp.where(bounded, within, normal).astype(uniform.dtype)
+        is_bounded = np.isfinite(space.low) & np.isfinite(space.high)
+        low = np.where(is_bounded, space.low, 0)
+        high = np.where(is_bounded, space.high, 1)
+        box_actions = jnp.asarray(low) + uniform * (high - low)
+        return jnp.where(is_bounded, box_actions, normal).astype(uniform.dtype)
 
     def check_state(self, state: object) -> None:
         """Raises ValueError for what is no state of these environments: machine code trusts it."""
@@ -326,9 +326,9 @@ class VectorEnv:
             f"engine={self.engine.name})"
         )
 
-    def _advance(self, state: VectorState, action: jax.Array, begins: ArrayLike) -> VectorState:
+    def _advance(self, state: VectorState, action: jax.Array, is_start: ArrayLike) -> VectorState:
         self.check_state(state)
-        return self._call(state, action, jnp.broadcast_to(begins, self.num_envs))
+        return self._call(state, action, jnp.broadcast_to(is_start, self.num_envs))
 
     def _null_actions(self) -> jax.Array:
         return jnp.zeros((self.num_envs, *self._null_action.shape), self._null_action.dtype)
@@ -345,13 +345,13 @@ class VectorEnv:
     def _check_memory(self) -> None:
         """Raises ValueError for more environments than there is memory for."""
         state_bytes = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(self._blank))
-        required_bytes = _COPIES * state_bytes * self.num_envs
+        required_bytes = _STATE_COPIES * state_bytes * self.num_envs
         memory_bytes = _memory()
         if required_bytes > memory_bytes:
             raise ValueError(
                 f"{self.num_envs:,} environments need {gigabytes(required_bytes)}, and there are "
                 f"{gigabytes(memory_bytes)}; make at most "
-                f"{int(memory_bytes / _COPIES / state_bytes):,}"
+                f"{int(memory_bytes / _STATE_COPIES / state_bytes):,}"
             )
 
 

@@ -29,7 +29,7 @@ def _to_torch(x: jax.Array) -> Any:
 
 #: How arrays are handed out, by name: copied, for the next step writes into the state's memory, or
 #: as they are on the device.
-_HAND_OUT: dict[str, Callable[[jax.Array], Any]] = {
+_CONVERTERS: dict[str, Callable[[jax.Array], Any]] = {
     "numpy": np.array,
     "jax": lambda x: x,
     "torch": _to_torch,
@@ -55,7 +55,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
           ValueError: an argument has no such value, there is nothing to render, or MuJoCo cannot
             draw here.
         """
-        check_name("arrays", arrays, _HAND_OUT)
+        check_name("arrays", arrays, _CONVERTERS)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be rgb_array or None, got {render_mode!r}")
         if render_mode and not hasattr(vec.env, "mj_model"):
@@ -81,7 +81,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch(self.single_observation_space, self.num_envs)
         self.action_space = batch(self.single_action_space, self.num_envs)
         self._arrays = arrays
-        self._out = _HAND_OUT[arrays]
+        self._out = _CONVERTERS[arrays]
         self._reset = jax.jit(vec.reset)
         self._restart = jax.jit(vec.restart)
         # What is handed out without a copy must outlive the next step.
@@ -150,9 +150,9 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self._check_open()
         if self.state is None:
             raise ValueError("call reset before step")
-        if self.vec.autoreset == "disabled" and (over := np.flatnonzero(self.state.done)).size:
+        if self.vec.autoreset == "disabled" and (envs := np.flatnonzero(self.state.done)).size:
             raise ValueError(
-                f"{over.size} of {self.num_envs} environments have ended, such as {over[0]}; with "
+                f"{envs.size} of {self.num_envs} environments have ended, such as {envs[0]}; with "
                 "autoreset='disabled' reset them before the next step: "
                 "reset(options={'reset_mask': terminated | truncated})"
             )
@@ -199,7 +199,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         # None in the list draws a seed of that environment at random.
         random_seeds = np.random.SeedSequence().generate_state(self.num_envs)
         pairs = zip(seed, random_seeds, strict=True)
-        return _keys_of([int(drawn if chosen is None else chosen) for chosen, drawn in pairs])
+        return _keys_of([int(draw if choice is None else choice) for choice, draw in pairs])
 
     def _reset_masked(self, seed: Seeds, mask: np.ndarray) -> VectorState:
         """Returns the environments with new episodes where a mask [N] says so, of seeds if any."""
@@ -231,9 +231,9 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             )
         space = self.single_action_space
         if isinstance(space, gymnasium.spaces.Discrete):
-            wrong = (actions < 0) | (actions >= space.n)
-            if actions.dtype.kind in "iu" and np.any(wrong):
-                raise ValueError(f"actions must be 0 to {space.n - 1}, got {actions[wrong][0]}")
+            is_bad = (actions < 0) | (actions >= space.n)
+            if actions.dtype.kind in "iu" and np.any(is_bad):
+                raise ValueError(f"actions must be 0 to {space.n - 1}, got {actions[is_bad][0]}")
         elif actions.dtype.kind == "f" and not np.all(np.isfinite(actions)):
             index = tuple(int(x) for x in np.argwhere(~np.isfinite(actions))[0])
             raise ValueError(f"actions must be finite numbers, got {actions[index]} at {index}")
@@ -247,27 +247,27 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         terms = {name: self._out(x) for name, x in state.metrics.items()}
         # With ``same_step`` the observation is a new start's where an episode has ended. What that
         # one left is in "final_info" then, and masked out beside it.
-        ended = np.asarray(state.done) & (self.vec.autoreset == "same_step")
-        info: dict[str, Any] = terms | {f"_{name}": ~ended for name in terms}
-        if ended.any():
-            info["final_info"] = terms | {f"_{name}": ended for name in terms}
-            info["_final_info"] = ended
-            info["final_obs"] = self._final_observations(state, ended)
-            info["_final_obs"] = ended
+        is_ended = np.asarray(state.done) & (self.vec.autoreset == "same_step")
+        info: dict[str, Any] = terms | {f"_{name}": ~is_ended for name in terms}
+        if is_ended.any():
+            info["final_info"] = terms | {f"_{name}": is_ended for name in terms}
+            info["_final_info"] = is_ended
+            info["final_obs"] = self._final_observations(state, is_ended)
+            info["_final_obs"] = is_ended
         nonfinite = np.asarray(state.nonfinite)
         if nonfinite.any():
             info["nonfinite"] = nonfinite
             info["_nonfinite"] = np.ones(self.num_envs, bool)
         return info
 
-    def _final_observations(self, state: VectorState, ended: np.ndarray) -> Any:
+    def _final_observations(self, state: VectorState, is_ended: np.ndarray) -> Any:
         """Returns the last observations; in NumPy an array of arrays and None, as Gymnasium has."""
         if self._arrays != "numpy":
             return self._out(state.final_obs)
         rows = np.asarray(state.final_obs)
         observations = np.full(self.num_envs, None, object)
         # One by one: NumPy would take an array of arrays for a matrix.
-        for i in np.flatnonzero(ended):
+        for i in np.flatnonzero(is_ended):
             observations[i] = rows[i]
         return observations
 

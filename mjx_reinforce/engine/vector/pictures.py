@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mjx_reinforce.engine.base import MjModel
 
 #: A floor's normal points upward by this much at least, [0, 1]: slopes of up to 60 degrees.
-_UPWARD = 0.5
+_MIN_UPWARD = 0.5
 
 
 class Renderer:
@@ -40,11 +40,11 @@ class Renderer:
         model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, max(width, height))
         self._robot = _traveler(model)
         self._camera = _camera(model)
-        extended = self._robot is not None and _lay_endless_floors(model)
+        is_extended = self._robot is not None and _lay_endless_floors(model)
         self._model = model
         self._data = mujoco.MjData(model)
         self._renderer = mujoco.Renderer(model, height, width)
-        if extended:  # without a white line at the horizon, which nobody asked for
+        if is_extended:  # without a white line at the horizon, which nobody asked for
             self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = False
         # Without this it closes itself when Python ends, too late for its own modules.
         self.close = weakref.finalize(self, self._renderer.close)
@@ -81,10 +81,10 @@ def _traveler(model: "MjModel") -> int | None:
     mujoco = import_mujoco()
     robot = model.jnt_bodyid[0] if model.njnt else -1
     # A free joint goes anywhere, and so does a slider without an end, as a planar walker's.
-    travels = (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE) | (
+    is_traveling = (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE) | (
         (model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & (model.jnt_limited == 0)
     )
-    if not travels[model.jnt_bodyid == robot].any():
+    if not is_traveling[model.jnt_bodyid == robot].any():
         return None
     return int(robot)
 
@@ -111,8 +111,8 @@ def _lay_endless_floors(model: "MjModel") -> bool:
     mujoco.mj_kinematics(model, data)
     # A plane with sizes of 0 has no ends already.
     planes = (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (model.geom_size[:, :2] > 0).any(1)
-    of_the_world = model.body_weldid[model.geom_bodyid] == 0
-    floors = planes & of_the_world & (data.geom_xmat[:, 8] > _UPWARD)
+    is_world_geom = model.body_weldid[model.geom_bodyid] == 0
+    floors = planes & is_world_geom & (data.geom_xmat[:, 8] > _MIN_UPWARD)
     if not floors.any():
         return False
     textured = floors & (model.geom_matid >= 0)
@@ -120,8 +120,8 @@ def _lay_endless_floors(model: "MjModel") -> bool:
     materials, indices = np.unique(model.geom_matid[textured], return_index=True)
     sizes = model.geom_size[textured][indices, :2]
     # A texture is repeated so often from side to side, or, without sides, every two meters.
-    by_size = ~model.mat_texuniform[materials]
-    model.mat_texrepeat[materials[by_size]] /= np.where(sizes > 0, sizes, 1)[by_size]
+    is_sized = ~model.mat_texuniform[materials]
+    model.mat_texrepeat[materials[is_sized]] /= np.where(sizes > 0, sizes, 1)[is_sized]
     model.geom_size[floors, :2] = 0
     model.vis.headlight.specular[:] = 0  # an endless floor is of large pieces that would flash
     return True
@@ -129,9 +129,9 @@ def _lay_endless_floors(model: "MjModel") -> bool:
 
 def import_mujoco() -> Any:
     """Returns MuJoCo; without a screen it is told to draw through EGL, where that is installed."""
-    without_screen = not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL")
+    is_headless = not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL")
     # MuJoCo reads the variable once, when it is imported.
-    if without_screen and "mujoco" not in sys.modules:
+    if is_headless and "mujoco" not in sys.modules:
         os.environ.setdefault("MUJOCO_GL", "egl")
     import mujoco
 

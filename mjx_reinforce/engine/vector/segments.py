@@ -132,22 +132,22 @@ def unroll(
         """Plays one step, and returns what was played in it, for ``lax.scan``."""
         outputs = jax.vmap(act, (None, 0))(params, state.obs)
         action = distribution.sample(outputs, distribution.noise(key, (vec.num_envs,)))
-        after = vec.step(state, action)
+        next_state = vec.step(state, action)
         # What had ended before the step began its next episode instead, and ignored the action.
         played = ~state.done if resets_take_steps else jnp.ones_like(state.done)
-        return after, Segment(
+        return next_state, Segment(
             observation=state.obs,
             action=action,
             log_prob=distribution.log_prob(outputs, action),
-            reward=after.reward,
-            terminated=after.terminated,
-            truncated=after.truncated,
-            nonfinite=after.nonfinite,
-            next_observation=after.final_obs,
+            reward=next_state.reward,
+            terminated=next_state.terminated,
+            truncated=next_state.truncated,
+            nonfinite=next_state.nonfinite,
+            next_observation=next_state.final_obs,
             played=played,
-            metrics=after.metrics,
-            episode_return=after.episode_return,
-            episode_length=after.episode_length,
+            metrics=next_state.metrics,
+            episode_return=next_state.episode_return,
+            episode_length=next_state.episode_length,
         )
 
     state_and_segment: Any = lax.scan(step, state, jax.random.split(key, num_steps))

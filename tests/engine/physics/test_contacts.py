@@ -231,7 +231,7 @@ def test_what_no_contact_couples_is_zero_in_every_jacobian():
         last = first + group.contacts * len(group.pyramid)
         block = np.asarray(rows[first:last]).reshape(group.contacts, -1, model.nv).max(1)
         found = (block[:, :, None] * block[:, None, :]).max(0) > 0
-        assert not np.any(found & ~group.coupled)
+        assert not np.any(found & ~group.coupling)
         first = last
     assert first == len(rows)
 

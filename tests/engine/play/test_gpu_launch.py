@@ -17,7 +17,7 @@ from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.cpu import handler, machine
 from mjx_reinforce.engine.gpu import ptx, seam
 from mjx_reinforce.engine.gpu.ptx import Assembler
-from mjx_reinforce.engine.gpu.source import Facts
+from mjx_reinforce.engine.gpu.source import Launch
 from mjx_reinforce.engine.play import available
 
 if reason := available.unavailable():
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.cpu
 POINTER, COUNT = ctypes.c_void_p, ctypes.c_uint
 LAUNCH = ctypes.CFUNCTYPE(ctypes.c_int, POINTER, *[COUNT] * 7, *[POINTER] * 3)
 TEXT = "// PTX\n"
-KERNEL = ptx.Kernel("0" * 64, "ptx", TEXT, Facts(threads=32, blocks=16), compiled=True)
+KERNEL = ptx.Kernel("0" * 64, "ptx", TEXT, Launch(threads=32, blocks=16), compiled=True)
 HEAD = '{"language": "ptx", "threads": 32, "blocks": 16, "scratch": 0, "lanes": 1, "shared": 0}\n'
 
 
@@ -74,7 +74,7 @@ def driver(monkeypatch):
 def handler_of_a_cpu(name):
     """Registers a handler that XLA's CPU runtime calls, which has no stream; returns its slot."""
     stream = "call ptr %get(ptr %asking)"
-    text = handler.with_entry(ptx._TEXT, {})
+    text = handler.with_entry(ptx._LAUNCHER, {})
     assert stream in text
     text = text.replace(stream, "getelementptr i8, ptr null, i64 0")
     names = ("handler", "slot")
@@ -238,7 +238,7 @@ def in_memory(monkeypatch, tmp_path):
         "register_ffi_target",
         lambda name, _, platform: registered.append((name, platform)),
     )
-    monkeypatch.setattr(ptx, "_LOADED", {KERNEL.key: KERNEL})
+    monkeypatch.setattr(ptx, "_CACHE", {KERNEL.key: KERNEL})
     return filled, registered
 
 

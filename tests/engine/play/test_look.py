@@ -14,7 +14,7 @@ from toys import Drifting
 from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.gpu import ptx
-from mjx_reinforce.engine.gpu.source import Facts, Source
+from mjx_reinforce.engine.gpu.source import Launch, Source
 from mjx_reinforce.engine.objects import distrust
 from mjx_reinforce.engine.play import available, program
 from mjx_reinforce.engine.play.choice import machine_code
@@ -33,8 +33,8 @@ attributes #0 = { "nvvm.maxntid"="128" "nvvm.minctasm"="2" }
 
 @pytest.fixture(autouse=True)
 def nothing_in_memory(monkeypatch):
-    monkeypatch.setattr(machine, "_LOADED", {})
-    monkeypatch.setattr(ptx, "_LOADED", {})
+    monkeypatch.setattr(machine, "_CACHE", {})
+    monkeypatch.setattr(ptx, "_CACHE", {})
     monkeypatch.delenv(objects.DEBUG, raising=False)
 
 
@@ -43,11 +43,11 @@ def test_nothing_is_said_unless_asked(monkeypatch, tmp_path, capfd):
         if value is not None:
             monkeypatch.setenv(objects.DEBUG, value)
         folder = tmp_path / str(number)
-        machine._LOADED.clear()
+        machine._CACHE.clear()
         key = items.load(folder).key
         assert capfd.readouterr() == ("", "")
         assert [path.name for path in folder.iterdir()] == [f"{key}.o"]
-        machine._LOADED.clear()
+        machine._CACHE.clear()
         assert not items.load(folder).compiled
 
 
@@ -57,7 +57,7 @@ def test_code_on_disk_is_built_again_and_described(monkeypatch, tmp_path, capfd)
     key = items.load(tmp_path).key
     monkeypatch.setenv(objects.DEBUG, "1")
     for folder in (tmp_path, None):
-        machine._LOADED.clear()
+        machine._CACHE.clear()
         assert items.load(folder).compiled
         items.load(folder)  # from memory, without a word
         (said,) = capfd.readouterr().err.splitlines()
@@ -71,7 +71,7 @@ def test_code_on_disk_is_built_again_and_described(monkeypatch, tmp_path, capfd)
 def test_a_kernel_for_a_gpu(monkeypatch, tmp_path, capfd):
     """Its assembler's log is told where it is assembled: see test_gpu_launch."""
     monkeypatch.setenv(objects.DEBUG, "1")
-    source = Source("llvm", KERNEL, Facts(threads=32, blocks=16))
+    source = Source("llvm", KERNEL, Launch(threads=32, blocks=16))
     made = ptx.load_kernel("toy", lambda: source, "9.0", tmp_path)
     said = capfd.readouterr().err
     assert said.startswith(f"kernel {made.key}: Toy, 7 scalar operations; LLVM took ")

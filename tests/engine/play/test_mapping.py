@@ -97,7 +97,7 @@ def test_a_long_text_takes_less_effort_and_gives_the_same_bits(mapped, monkeypat
 
     monkeypatch.setattr(machine, "_effort", noted)
     monkeypatch.setattr(machine, "_LONG_TEXT", 0)
-    monkeypatch.setattr(machine, "_LOADED", {})
+    monkeypatch.setattr(machine, "_CACHE", {})
     monkeypatch.setattr(program.objects, "folder", lambda: None)
     other = jax.jit(machine_map(named, *jax.tree.map(lambda x: x[0], batch(1))))(*batch(37))
     for name, x in mapped(*batch(37)).items():

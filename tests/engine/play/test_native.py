@@ -154,8 +154,8 @@ def test_no_code_is_made_twice(tmp_path, monkeypatch):
     assert first.code.compiled
     assert program.build_program(env, act, actor, distribution, 17).code is first.code
     assert program.build_program(env, act, actor, distribution, 19).code is not first.code
-    monkeypatch.setattr(machine, "_LOADED", {})
-    monkeypatch.setattr(ptx, "_LOADED", {})
+    monkeypatch.setattr(machine, "_CACHE", {})
+    monkeypatch.setattr(ptx, "_CACHE", {})
     monkeypatch.setattr(program.scalarized, "build", None)
     assert not program.build_program(env, act, actor, distribution, 17).code.compiled
 
@@ -222,7 +222,7 @@ def test_auto_falls_back_whatever_the_writer_raises(monkeypatch):
         raise error
 
     monkeypatch.setattr(program.kernel, "kernel_text", write)
-    monkeypatch.setattr(machine, "_LOADED", {})
+    monkeypatch.setattr(machine, "_CACHE", {})
     monkeypatch.setattr(objects, "folder", lambda: None)
     for error in (KeyError("lost"), ValueError("cannot reshape"), RecursionError("deep")):
         engine = chosen(Drifting())
@@ -235,7 +235,7 @@ def test_auto_falls_back_whatever_the_writer_raises(monkeypatch):
 @pytest.mark.cpu
 def test_large_models_are_not_for_machine_code(monkeypatch):
     monkeypatch.setattr(objects, "folder", lambda: None)
-    monkeypatch.setattr(machine, "_LOADED", {})
+    monkeypatch.setattr(machine, "_CACHE", {})
     monkeypatch.setattr(size, "MAX_SCALARS", 9)
     engine = chosen(Drifting())
     assert engine.name == "vmap"

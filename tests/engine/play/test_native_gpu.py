@@ -65,7 +65,7 @@ def test_the_same_episodes_as_everywhere(env, distribution, monkeypatch):
 @pytest.mark.slow
 def test_episodes_that_are_not_active_are_not_played(busy, monkeypatch):
     """Also in step with others: a thread that never had an episode counts no steps."""
-    monkeypatch.setattr(kernels, "LONG", 0)
+    monkeypatch.setattr(kernels, "LONG_BODY", 0)
     chosen = np.array([[0] * 5, [0, 1, 0, 0, 1], [0] * 5]).astype(bool)
     options = {"horizon": 20, "deterministic": jnp.arange(5) % 2 == 1}
     for threads in (1, 3):
@@ -90,7 +90,7 @@ def test_in_step_or_apart_an_episode_is_the_same(busy, monkeypatch):
     for long in (10**9, 4, 0):
         block = gpu_on_cpu.Block(3)
         gpu_on_cpu.emulate(monkeypatch, block=block)
-        monkeypatch.setattr(kernels, "LONG", long)
+        monkeypatch.setattr(kernels, "LONG_BODY", long)
         got = played(native.native_rollout, *busy, horizon=30)
         assert block.apart is None
         meetings.append(block.meetings)
@@ -110,7 +110,7 @@ def test_threads_meet_where_some_have_no_room_for_their_contacts(monkeypatch):
     assert {0, 1, 2} <= {*touch.ravel().astype(int)}
     block = gpu_on_cpu.Block(3)
     gpu_on_cpu.emulate(monkeypatch, block=block)
-    monkeypatch.setattr(kernels, "LONG", 0)
+    monkeypatch.setattr(kernels, "LONG_BODY", 0)
     assert_identical(played(native.native_rollout, env, who, **size), want)
     assert block.apart is None
 
@@ -136,7 +136,7 @@ def test_ptx(busy, long, tmp_path, monkeypatch):
     """It is one kernel that calls nothing; NVIDIA's assembler takes it, where there is one."""
     env, player = busy
     if long:
-        monkeypatch.setattr(kernels, "LONG", 4)
+        monkeypatch.setattr(kernels, "LONG_BODY", 4)
     llvm = kernel_text(env, *player)
 
     def on_disk():
@@ -145,7 +145,7 @@ def test_ptx(busy, long, tmp_path, monkeypatch):
     for capability in ("7.5", "9.0"):
         made = ptx.load_kernel(llvm.text, lambda: llvm, capability, tmp_path)
         assert (made.compiled, made.language) == (True, "ptx")
-        threads, blocks = made.facts[:2]
+        threads, blocks = made.launch[:2]
         assert (threads, blocks) == ((256, 1) if long else (32, 16))
         assert f".maxntid {threads}" in made.text
         assert f".minnctapersm {blocks}" in made.text
@@ -156,7 +156,7 @@ def test_ptx(busy, long, tmp_path, monkeypatch):
         meetings = re.findall(r"(bar.warp.sync 0xffffffff; )?bar(?:rier)?\.(?:sync|red)", made.text)
         assert meetings
         assert all(meetings)  # a warp comes together before each: an H200 waited forever without
-        ptx._LOADED.clear()
+        ptx._CACHE.clear()
         again = ptx.load_kernel(llvm.text, on_disk, capability, tmp_path)
         assert again == made._replace(compiled=False)
         if shutil.which("ptxas"):

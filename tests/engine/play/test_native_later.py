@@ -25,7 +25,7 @@ def everything_is_long(monkeypatch, request):
     """And XLA has not met it: it takes a handler's name once."""
     text = f"; {request.node.name}\n{items.text()}"
     monkeypatch.setattr(items, "text", lambda lanes: text)
-    monkeypatch.setattr(machine, "_LOADED", {})
+    monkeypatch.setattr(machine, "_CACHE", {})
     monkeypatch.setattr(machine, "_LONG_TEXT", len(text) - 1)
 
 
@@ -57,7 +57,7 @@ def test_what_xla_compiled_meanwhile_waits_for_it(slow, tmp_path):
     items.check(play(jnp.array(ACTIVE)), ACTIVE)
     assert time.monotonic() - began > 0.1
     assert code.compiled
-    machine._LOADED.clear()
+    machine._CACHE.clear()
     assert not items.load(tmp_path).compiled  # it is on disk
 
 
@@ -97,10 +97,10 @@ def program(tmp_path, line):
 def test_where_no_other_process_starts_this_one_compiles(monkeypatch, tmp_path):
     monkeypatch.setattr(sys, "executable", program(tmp_path, "exit 3"))
     assert "handler" in items.load().addresses
-    monkeypatch.setattr(machine, "_LOADED", {})
+    monkeypatch.setattr(machine, "_CACHE", {})
     monkeypatch.setattr(sys, "executable", str(tmp_path / "nothing"))
     assert "handler" in items.load().addresses
-    monkeypatch.setattr(machine, "_LOADED", {})
+    monkeypatch.setattr(machine, "_CACHE", {})
     monkeypatch.setattr(sys, "executable", "")
     code = items.load()
     assert isinstance(code.future_addresses, Future)

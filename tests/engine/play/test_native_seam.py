@@ -316,8 +316,8 @@ NUMBERS = itertools.count(20)
 def kept_code(tmp_path, monkeypatch):
     """Code that is on disk, of which this process forgets how it is called."""
     monkeypatch.setattr(objects, "folder", lambda: tmp_path)
-    monkeypatch.setattr(seam, "_REGISTERED", set())
-    monkeypatch.setattr(machine, "_LOADED", {})
+    monkeypatch.setattr(seam, "_HANDLER_KEYS", set())
+    monkeypatch.setattr(machine, "_CACHE", {})
     return items.load(tmp_path, lanes=next(NUMBERS))
 
 
@@ -329,14 +329,14 @@ def test_the_name_of_a_handler_is_that_of_its_code(kept_code):
 def test_a_program_on_disk_finds_its_code(kept_code, monkeypatch):
     program = b"... mjx_reinforce_" + kept_code.key.encode() + b" ..."
     assert seam.restore(program)
-    monkeypatch.setattr(machine, "_LOADED", {})
+    monkeypatch.setattr(machine, "_CACHE", {})
     assert seam.restore(program * 2)
     assert seam.targets() == [f"mjx_reinforce_{kept_code.key}"]
 
 
 def test_code_that_is_gone_is_not_restored(kept_code, tmp_path, monkeypatch):
     assert not seam.restore(b"mjx_reinforce_" + b"0" * 64)
-    monkeypatch.setattr(machine, "_LOADED", {})
+    monkeypatch.setattr(machine, "_CACHE", {})
     for path in tmp_path.iterdir():
         path.unlink()
     assert not seam.restore(seam._target(kept_code.key).encode())

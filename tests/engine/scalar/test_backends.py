@@ -17,7 +17,7 @@ from mjx_reinforce.engine.play import program
 from mjx_reinforce.engine.play.program import machine_map
 from mjx_reinforce.engine.scalar import scalarized, skippable
 from mjx_reinforce.engine.scalar.graph import Graph
-from mjx_reinforce.engine.scalar.nodes import FACTS, Op, conversion, is_constant
+from mjx_reinforce.engine.scalar.nodes import OP_TRAITS, Op, conversion, is_constant
 from mjx_reinforce.engine.scalar.passes import simplify
 from mjx_reinforce.engine.scalar.passes.liveness import LiveLoop, accumulators
 from mjx_reinforce.engine.scalar.vmap import XLA
@@ -56,12 +56,12 @@ def operands_of(name):
 def dtype_of(op, operands):
     if "new_dtype" in dict(op.params):
         return dict(op.params)["new_dtype"]
-    return np.dtype(bool) if FACTS[op.name].is_predicate else operands[-1].dtype
+    return np.dtype(bool) if OP_TRAITS[op.name].is_predicate else operands[-1].dtype
 
 
 def test_a_backend_with_a_table_knows_every_operation():
     for backend in (XLA, LLVM):
-        assert set(backend.OPERATIONS or FACTS) == set(FACTS)
+        assert set(backend.OPERATIONS or OP_TRAITS) == set(OP_TRAITS)
 
 
 def test_a_backend_walks_loops_and_gates():
@@ -120,7 +120,7 @@ def folded_and_computed(name):
 @pytest.mark.slow
 def test_constants_fold_to_what_jax_computes():
     """The same operation on constants, on lanes, and on both, in every order."""
-    for name in FACTS:
+    for name in OP_TRAITS:
         computed, folded = folded_and_computed(name)
         want = np.full((len(computed), 2), folded)
         np.testing.assert_allclose(computed, want, rtol=1e-5, err_msg=name)
@@ -128,7 +128,7 @@ def test_constants_fold_to_what_jax_computes():
 
 def test_operations_that_commute_are_shared():
     graph = Graph(0, 4)
-    for name in (n for n, facts in FACTS.items() if facts.commutes):
+    for name in (n for n, traits in OP_TRAITS.items() if traits.commutes):
         x, y = (graph.leaf(operands_of(name)[0].dtype, True) for _ in range(2))
         assert graph.call(name, x, y) is graph.call(name, y, x), name
 
@@ -257,7 +257,7 @@ FUNCTIONS = [added_up, twice, start_read_again, begun_again, never_read, ends_ea
 @pytest.mark.cpu
 def test_machine_code_gives_the_results_of_vmap(function, few, monkeypatch):
     """Of lanes that need all sums, some and none."""
-    monkeypatch.setattr(LLVM, "MANY", 1_000 if few else 1)
+    monkeypatch.setattr(LLVM, "MANY_CARRIES", 1_000 if few else 1)
     weights = jnp.asarray(np.random.default_rng(1).normal(size=(37, 4)), jnp.float32)
     weights = weights.at[0].set(-1).at[1].set(1)
     # Machine code is kept by the function that it is of: each of the two has its own.

@@ -126,7 +126,7 @@ def test_what_is_too_large_is_refused_and_what_compiles_long_is_warned_of(monkey
     with pytest.raises(scalar.TooLarge, match="is about 40 scalar operations, more than 30"):
         scalar.vmap(double)(jnp.ones((2, 20)))
     monkeypatch.setattr(size, "MAX_SCALARS", 40)
-    monkeypatch.setattr(graph, "_MOST", 39)
+    monkeypatch.setattr(graph, "_MAX_NODES", 39)
     with pytest.raises(scalar.TooLarge, match="is more than 39 scalar operations"):
         scalar.vmap(double)(jnp.ones((2, 20)))
 

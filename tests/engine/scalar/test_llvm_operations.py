@@ -14,7 +14,7 @@ from lane_code import call, engine, parse
 from scipy import special
 
 from mjx_reinforce.engine.llvm.lanes import Lanes
-from mjx_reinforce.engine.llvm.math import FUNCTIONS, RARE
+from mjx_reinforce.engine.llvm.math import FUNCTIONS, RARE_FUNCTIONS
 from mjx_reinforce.engine.llvm.operations import OPERATIONS
 from mjx_reinforce.engine.llvm.text import Text
 from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive
@@ -399,7 +399,7 @@ def test_float32_calls_no_library(triple, cpu, lanes, call):
     llvm.initialize_all_asmprinters()
     target = llvm.Target.from_triple(triple).create_target_machine(cpu=cpu, opt=2)
     for name, (_, operands, _) in CASES.items():
-        if name in RARE:
+        if name in RARE_FUNCTIONS:
             continue
         text = Text(lanes)
         kind = text.type("float32")

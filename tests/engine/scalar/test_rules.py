@@ -11,7 +11,7 @@ from mapped import BATCH, assert_all_same, batch_of, count, folded
 
 from mjx_reinforce.engine import scalar
 from mjx_reinforce.engine.scalar import UnsupportedPrimitive
-from mjx_reinforce.engine.scalar.nodes import FACTS
+from mjx_reinforce.engine.scalar.nodes import OP_TRAITS
 from mjx_reinforce.engine.scalar.rules import structural
 
 #: Functions of any float; their integers are the eighths of it, and some are shifted and divided.
@@ -89,7 +89,7 @@ def test_bits_of_another_size_are_refused():
 
 
 def test_every_operation_has_the_general_rule_or_one_of_its_own():
-    assert FACTS.keys() <= structural.RULES.keys()
+    assert OP_TRAITS.keys() <= structural.RULES.keys()
 
 
 MOVES = {

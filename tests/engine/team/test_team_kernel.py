@@ -48,7 +48,7 @@ def test_teams_play_the_same_episodes(teams, name):
     want = played(native.native_rollout, env, player, **options)
     made = teams()
     got = played(native.native_rollout, env, player, **options)
-    assert [kernel.facts.lanes for kernel in made] == [16, 16]  # one plays, one begins
+    assert [kernel.launch.lanes for kernel in made] == [16, 16]  # one plays, one begins
     first = min(horizon, 12)  # steps until rounding has grown
     for name in ("observation", "action", "reward"):
         pair = (getattr(x, name)[:, :first] for x in (got, want))
@@ -74,7 +74,7 @@ def test_teams_play_only_active_episodes(teams):
     chosen = np.arange(15).reshape(3, 5) % 2 == 1
     made, player = teams(), actor_and_act(env, ())
     some = only_active(native.native_rollout, env, player, chosen, horizon=20).mask.any(1)
-    assert (some.tolist(), {kernel.facts.lanes for kernel in made}) == (chosen.tolist(), {16})
+    assert (some.tolist(), {kernel.launch.lanes for kernel in made}) == (chosen.tolist(), {16})
 
 
 @pytest.mark.slow
@@ -87,5 +87,5 @@ def test_teams_step_environments_side_by_side(teams):
         found.append(vec.reset(jax.random.key(0)))
         for _ in range(4):
             found[-1] = vec.step(found[-1], action)
-    assert {kernel.facts.lanes for kernel in made} == {16}
+    assert {kernel.launch.lanes for kernel in made} == {16}
     np.testing.assert_allclose(*[state.obs for state in found], rtol=2e-3, atol=2e-3)

@@ -113,7 +113,7 @@ def _error(m: Any, play: Any, data: Any, skip: int) -> float:
     return max(errors)
 
 
-def _largest_error(m: Any, folder: Any, skip: int, starts: int, near=tables.NEAR, lanes=1):
+def _largest_error(m: Any, folder: Any, skip: int, starts: int, near=tables.NUM_NEAR, lanes=1):
     """Returns the largest error of steps along short episodes of random play."""
     play = _compiled(_exact(m), folder, near, lanes)
     rng, errors = np.random.default_rng(0), []
@@ -170,7 +170,7 @@ def test_a_capsule_meets_a_box_in_every_pose(sizes, tmp_path):
     size = contacts.draw(geoms, families[0], rng).size
     first, second = (" ".join(map(str, x)) for x in size)
     m = _exact(_C.MjModel.from_xml_string(_TWO.format(first=first, second=second)))
-    play, errors = _compiled(m, tmp_path, tables.NEAR, 1), []
+    play, errors = _compiled(m, tmp_path, tables.NUM_NEAR, 1), []
     for family in families:
         pose, data = contacts.draw(geoms, family, rng, size), _C.MjData(m)
         back, exact = pose.mat[0].T, geoms.by_c(pose)

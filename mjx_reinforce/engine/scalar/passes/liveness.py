@@ -159,16 +159,16 @@ def schedule(root: Scope, results: Iterable[Scalar]) -> Schedule:
       root: the scope of the whole program.
       results: scalars of that scope.
     """
-    needs = _Needs()
+    demands = _Needs()
     # A list and no recursion: chains of operands are longer than Python's stack.
-    waiting = list(results)
-    noted = set()
-    while waiting:
-        node = waiting.pop()
-        if isinstance(node, Node) and node not in noted:
-            noted.add(node)
-            waiting.extend(needs.note(node))
-    return needs.steps_of(root)
+    stack = list(results)
+    noted_nodes = set()
+    while stack:
+        node = stack.pop()
+        if isinstance(node, Node) and node not in noted_nodes:
+            noted_nodes.add(node)
+            stack.extend(demands.note(node))
+    return demands.steps_of(root)
 
 
 class _Needs:
@@ -208,20 +208,20 @@ class _Needs:
         """
         role, i = position[:2]
         if role == "element":
-            needs = list(loop.xs[i])
+            operands = list(loop.xs[i])
         elif role == "y":
-            needs = [loop.ys[i]]
+            operands = [loop.ys[i]]
         elif role == "out" and loop.length and loop.active is None:
             # At least one iteration runs and sets it, so nothing reads the init.
-            needs = [loop.nexts[i]]
+            operands = [loop.nexts[i]]
         else:
             # After a loop that may not run at all, the carry is its init.
             role = "carry"
-            needs = [loop.inits[i], loop.nexts[i]]
+            operands = [loop.inits[i], loop.nexts[i]]
         self._places[loop][role].add(i)
         if loop.active is not None:
-            needs.append(loop.carries[loop.active])
-        return needs
+            operands.append(loop.carries[loop.active])
+        return operands
 
     def steps_of(self, scope: Scope) -> Schedule:
         """Returns the steps of a scope in order."""
@@ -247,16 +247,16 @@ class _Needs:
 
     def _loop(self, loop: Loop) -> LiveLoop:
         """Returns a loop with what is needed of its carry, its elements and its ys."""
-        places = {role: sorted(numbers) for role, numbers in self._places[loop].items()}
-        read = set(places.get("carry", ()))
-        carried = sorted(read.union(places.get("out", ())))
+        places = {role: sorted(indices) for role, indices in self._places[loop].items()}
+        read_carries = set(places.get("carry", ()))
+        carry_indices = sorted(read_carries.union(places.get("out", ())))
         carries = []
-        for i in carried:
+        for i in carry_indices:
             leaf = loop.carries[i]
-            out = loop.outs[i]
-            if leaf is not None and out is not None:
-                init = loop.inits[i] if i in read else leaf.dtype.type(0)
-                carries.append(Carry(leaf, init, loop.nexts[i], out))
+            result = loop.outs[i]
+            if leaf is not None and result is not None:
+                init = loop.inits[i] if i in read_carries else leaf.dtype.type(0)
+                carries.append(Carry(leaf, init, loop.nexts[i], result))
         elements = [
             Element(leaf, loop.xs[j])
             for j in places.get("element", [])
@@ -265,13 +265,13 @@ class _Needs:
         records = [Record(loop.ys[j], loop.stacked[j]) for j in places.get("y", [])]
         active = None
         if loop.active is not None:
-            active = carried.index(loop.active)
+            active = carry_indices.index(loop.active)
         return LiveLoop(loop.length, active, self.steps_of(loop.body), carries, elements, records)
 
 
-def reads(body: Schedule, ends: Iterable[Scalar] = ()) -> Counter[Node]:
+def reads(body: Schedule, outputs: Iterable[Scalar] = ()) -> Counter[Node]:
     """Returns how often a schedule, also inside of its steps, and its ends read each node."""
-    return Counter(_nodes([*_read_in(body), *ends]))
+    return Counter(_nodes([*_read_in(body), *outputs]))
 
 
 def unread(loop: LiveLoop) -> set[Node]:
@@ -288,7 +288,7 @@ def accumulators(loop: LiveLoop) -> dict[Node, Carry]:
     """
     num_reads = reads(loop.body, _ends(loop))
     carries = {carry.next: carry for carry in loop.carries if isinstance(carry.next, Node)}
-    in_place = {}
+    slots = {}
     for gate in loop.body:
         if not isinstance(gate, LiveGate):
             continue
@@ -299,18 +299,18 @@ def accumulators(loop: LiveLoop) -> dict[Node, Carry]:
                 continue
             # The nodes of the branch are the only ones that read it; the gate itself names it once
             # more, as what stays where the branch is skipped.
-            only_here = num_reads[carry.leaf] == branch.num_reads[carry.leaf] + 1
+            is_only_read = num_reads[carry.leaf] == branch.num_reads[carry.leaf] + 1
             # The new value is stored as soon as it is known: no node may read the old one after it.
-            in_time = branch.last_read.get(carry.leaf, -1) <= branch.places.get(out.hot, -1)
+            is_in_time = branch.last_read.get(carry.leaf, -1) <= branch.places.get(out.hot, -1)
             if (
                 num_reads[out.leaf] == 1
-                and only_here
-                and in_time
-                and out.hot not in in_place
+                and is_only_read
+                and is_in_time
+                and out.hot not in slots
                 and out.hot.op != SELECT
             ):
-                in_place[out.hot] = carry
-    return in_place
+                slots[out.hot] = carry
+    return slots
 
 
 def _ends(loop: LiveLoop) -> list[Scalar]:

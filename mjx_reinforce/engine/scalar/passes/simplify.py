@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from mjx_reinforce.engine.scalar import jaxprs
-from mjx_reinforce.engine.scalar.nodes import FACTS, Node, Op, Scalar, is_constant, same
+from mjx_reinforce.engine.scalar.nodes import OP_TRAITS, Node, Op, Scalar, is_constant, same
 
 # Greater powers are not faster as products than as ``pow``.
 _LARGEST_POWER = 8
@@ -48,8 +48,8 @@ def fold(op: Op, operands: Sequence[Any], dtype: np.dtype) -> Any:
         value = np.asarray(operands[0]).astype(dtype)
     elif name == "bitcast_convert_type":
         value = np.asarray(operands[0]).view(dtype)
-    elif (by_numpy := _EXCEPTIONS.get(name, FACTS[name].in_numpy)) is not None:
-        value = by_numpy(*operands)
+    elif (function := _EXCEPTIONS.get(name, OP_TRAITS[name].numpy_function)) is not None:
+        value = function(*operands)
     else:
         value = jaxprs.compute_constants(jaxprs.operation(name), dict(op.params), operands)[0]
     # NumPy may compute in a wider dtype than JAX. ``[()]`` makes a scalar of an array of no axes.
@@ -62,8 +62,8 @@ def _divide(x: np.ndarray, y: np.ndarray) -> Any:
         return np.true_divide(x, y)
     # NumPy rounds towards minus infinity. Less the remainder, which has the sign of x, the division
     # is exact.
-    minus_1 = ~np.zeros_like(y)  # in an unsigned integer the greatest
-    return np.where(y == 0, minus_1, (x - _remainder(x, y)) // np.where(y == 0, 1, y))
+    all_ones = ~np.zeros_like(y)  # in an unsigned integer the greatest
+    return np.where(y == 0, all_ones, (x - _remainder(x, y)) // np.where(y == 0, 1, y))
 
 
 def _remainder(x: np.ndarray, y: np.ndarray) -> Any:
@@ -106,12 +106,12 @@ _EXCEPTIONS: dict[str, Callable[..., Any]] = {
 
 def simplify(graph: Builder, op: Op, args: tuple[Scalar, ...], dtype: np.dtype) -> Scalar | None:
     """Returns a simpler scalar equal to op(*args), or None; at least one operand is a node."""
-    simpler = None
+    simple_form = None
     if op.name in _RULES:
-        simpler = _RULES[op.name](graph, *args)
-    if simpler is None and op.name != "select_n":
-        simpler = _through_select(graph, op, args, dtype)
-    return simpler
+        simple_form = _RULES[op.name](graph, *args)
+    if simple_form is None and op.name != "select_n":
+        simple_form = _through_select(graph, op, args, dtype)
+    return simple_form
 
 
 def power(graph: Builder, base: Scalar, exponent: int) -> Scalar:
@@ -187,9 +187,9 @@ def _mul(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
             if is_constant(scale):
                 return graph.call("mul", _negated(factor), -scale)
             return graph.call("neg", graph.call("mul", _negated(factor), scale))
-        masked = _mask(graph, factor, scale)
-        if masked is not None:
-            return masked
+        masked_factor = _mask(graph, factor, scale)
+        if masked_factor is not None:
+            return masked_factor
     return None
 
 
@@ -238,28 +238,28 @@ def _neg(graph: Builder, x: Scalar) -> Scalar | None:
 
 
 def _abs(graph: Builder, x: Scalar) -> Scalar | None:
-    negated = _negated(x)
-    if negated is None:
+    negative = _negated(x)
+    if negative is None:
         return None
-    return graph.call("abs", negated)
+    return graph.call("abs", negative)
 
 
-def _extreme(x: Scalar, y: Scalar, neutral: float) -> Scalar | None:
+def _extreme(x: Scalar, y: Scalar, identity: float) -> Scalar | None:
     """Simplifies ``max`` and ``min`` of a scalar and itself, or the number that never wins."""
-    if x is y or _is(y, neutral):
+    if x is y or _is(y, identity):
         return x
-    if _is(x, neutral):
+    if _is(x, identity):
         return y
     return None
 
 
-def _bitwise(x: Scalar, y: Scalar, absorbing: bool) -> Scalar | None:
+def _bitwise(x: Scalar, y: Scalar, zero_element: bool) -> Scalar | None:
     """Simplifies ``and`` (absorbing False) and ``or`` (absorbing True) of bools."""
     if x.dtype != np.bool_:
         return None
     for operand, flag in ((x, y), (y, x)):
         if is_constant(flag):
-            return flag if bool(flag) is absorbing else operand
+            return flag if bool(flag) is zero_element else operand
     if x is y:
         return x
     return None
@@ -286,9 +286,9 @@ def _select(graph: Builder, predicate: Scalar, *cases: Scalar) -> Scalar | None:
     if inverse:
         return graph.select(inverse[0], on_false, on_true)
     if on_true.dtype == np.bool_:
-        simpler = _select_bool(graph, predicate, on_true, on_false)
-        if simpler is not None:
-            return simpler
+        simple_form = _select_bool(graph, predicate, on_true, on_false)
+        if simple_form is not None:
+            return simple_form
     return _select_again(graph, predicate, on_true, on_false)
 
 
@@ -303,8 +303,8 @@ def _select_bool(
     if _is(on_false, False):
         return graph.call("and", predicate, on_true)
     if _is(on_true, False):
-        opposite = graph.call("not", predicate)
-        return opposite if _is(on_false, True) else graph.call("and", opposite, on_false)
+        negation = graph.call("not", predicate)
+        return negation if _is(on_false, True) else graph.call("and", negation, on_false)
     if _is(on_false, True):
         return graph.call("or", graph.call("not", predicate), on_true)
     return None
@@ -314,12 +314,12 @@ def _select_again(
     graph: Builder, predicate: Scalar, on_true: Scalar, on_false: Scalar
 ) -> Scalar | None:
     """Drops the case of an inner selection that the same predicate rules out."""
-    inner = _args(on_true, "select_n")
-    if inner and len(inner) == 3 and inner[0] is predicate:
-        return graph.select(predicate, inner[2], on_false)
-    inner = _args(on_false, "select_n")
-    if inner and len(inner) == 3 and inner[0] is predicate:
-        return graph.select(predicate, on_true, inner[1])
+    inner_args = _args(on_true, "select_n")
+    if inner_args and len(inner_args) == 3 and inner_args[0] is predicate:
+        return graph.select(predicate, inner_args[2], on_false)
+    inner_args = _args(on_false, "select_n")
+    if inner_args and len(inner_args) == 3 and inner_args[0] is predicate:
+        return graph.select(predicate, on_true, inner_args[1])
     return None
 
 
@@ -339,9 +339,9 @@ def _through_select(
         if not (is_constant(choice[1]) and is_constant(choice[2])):
             return None
     cases = []
-    for case in (1, 2):
-        chosen = [arg if is_constant(arg) else arg.args[case] for arg in args]
-        cases.append(fold(op, chosen, dtype))
+    for case_index in (1, 2):
+        case_args = [arg if is_constant(arg) else arg.args[case_index] for arg in args]
+        cases.append(fold(op, case_args, dtype))
     return graph.select(nodes[0].args[0], cases[1], cases[0])
 
 
@@ -355,8 +355,8 @@ _RULES: dict[str, Callable[..., Scalar | None]] = {
     "abs": _abs,
     "max": lambda _, x, y: _extreme(x, y, -np.inf),
     "min": lambda _, x, y: _extreme(x, y, np.inf),
-    "and": lambda _, x, y: _bitwise(x, y, absorbing=False),
-    "or": lambda _, x, y: _bitwise(x, y, absorbing=True),
+    "and": lambda _, x, y: _bitwise(x, y, zero_element=False),
+    "or": lambda _, x, y: _bitwise(x, y, zero_element=True),
     "not": _not,
     "select_n": _select,
 }

@@ -37,12 +37,12 @@ class Window(NamedTuple):
 
     positions: where its elements are while the unknown starts are 0.
     unknowns: the starts that are not constants.
-    inside: whether the constant starts keep it inside the operand.
+    is_inside: whether the constant starts keep it inside the operand.
     """
 
     positions: Array
     unknowns: list[Unknown]
-    inside: bool
+    is_inside: bool
 
 
 def _window(shape: Sequence[int], sizes: Sequence[int], starts: Sequence[Any]) -> Window:
@@ -54,46 +54,46 @@ def _window(shape: Sequence[int], sizes: Sequence[int], starts: Sequence[Any]) -
     for grid, stride in zip(grids, strides, strict=True):
         positions = positions + grid * stride
     unknowns = []
-    inside = True
+    is_inside = True
     for start, stride, limit, size in zip(starts, strides, shape, sizes, strict=True):
         if isinstance(start, (int, np.integer)):
-            nearest = min(max(int(start), 0), limit - size)
-            inside &= nearest == start
-            positions = positions + nearest * stride
+            clipped_start = min(max(int(start), 0), limit - size)
+            is_inside &= clipped_start == start
+            positions = positions + clipped_start * stride
         else:
             unknowns.append(Unknown(start, stride, limit - size + 1))
-    return Window(positions, unknowns, inside)
+    return Window(positions, unknowns, is_inside)
 
 
-def _read_window(graph: Graph, flat: Array, positions: Array, unknowns: list) -> Array:
+def _read_window(graph: Graph, cells: Array, positions: Array, unknowns: list) -> Array:
     """Reads a window; an unknown start outside counts as the nearest inside."""
     if not unknowns:
-        return arrays.lift(flat[positions.reshape(-1)].reshape(positions.shape))
+        return arrays.lift(cells[positions.reshape(-1)].reshape(positions.shape))
     (index, stride, count), *inner_unknowns = unknowns
-    values = _read_window(graph, flat, positions, inner_unknowns)
+    values = _read_window(graph, cells, positions, inner_unknowns)
     # A chain of selections: start k replaces start k - 1 where the index is at least k.
     for k in range(1, count):
-        later = _read_window(graph, flat, positions + k * stride, inner_unknowns)
-        reached = graph.call("ge", index, index.dtype.type(k))
-        select = functools.partial(graph.select, reached)
-        values = arrays.map_elements(select, values.shape, object, later, values)
+        next_window = _read_window(graph, cells, positions + k * stride, inner_unknowns)
+        is_reached = graph.call("ge", index, index.dtype.type(k))
+        select = functools.partial(graph.select, is_reached)
+        values = arrays.map_elements(select, values.shape, object, next_window, values)
     return values
 
 
 def _write_window(
-    graph: Graph, flat: Array, window: Window, updates: Array, combine: Callable
+    graph: Graph, cells: Array, window: Window, updates: Array, combine: Callable
 ) -> None:
     """Combines updates into a window, in place; a start outside changes nothing."""
-    for ks in itertools.product(*(range(unknown.num_starts) for unknown in window.unknowns)):
+    for steps in itertools.product(*(range(start.num_starts) for start in window.unknowns)):
         # Whether the window starts here, for one place of all that it may have.
-        hit = np.True_
+        is_hit = np.True_
         offset = 0
-        for k, (index, stride, _) in zip(ks, window.unknowns, strict=True):
-            hit = graph.call("and", hit, graph.call("eq", index, index.dtype.type(k)))
+        for k, (index, stride, _) in zip(steps, window.unknowns, strict=True):
+            is_hit = graph.call("and", is_hit, graph.call("eq", index, index.dtype.type(k)))
             offset += k * stride
         places = (window.positions + offset).reshape(-1)
         for place, update in zip(places, arrays.elements(updates), strict=True):
-            flat[place] = graph.select(hit, combine(graph, flat[place], update), flat[place])
+            cells[place] = graph.select(is_hit, combine(graph, cells[place], update), cells[place])
 
 
 def _starts(
@@ -120,42 +120,42 @@ def _gather_rule(graph: Graph, eqn: Equation, operand: Array, indices: Array) ->
     dims = eqn.params["dimension_numbers"]
     sizes = eqn.params["slice_sizes"]
     aval = eqn.outvars[0].aval
-    flat = operand.reshape(-1)
+    cells = operand.reshape(-1)
     # Axes of size 1 that the windows do not show in the result.
-    hidden = {*dims.collapsed_slice_dims, *dims.operand_batching_dims}
-    window_shape = [size for axis, size in enumerate(sizes) if axis not in hidden]
+    hidden_dims = {*dims.collapsed_slice_dims, *dims.operand_batching_dims}
+    window_shape = [size for axis, size in enumerate(sizes) if axis not in hidden_dims]
     batching = (dims.operand_batching_dims, dims.start_indices_batching_dims)
     windows = []
     for start in _starts(indices, operand.ndim, dims.start_index_map, *batching):
         window = _window(operand.shape, sizes, start)
-        values = _read_window(graph, flat, window.positions, window.unknowns)
+        values = _read_window(graph, cells, window.positions, window.unknowns)
         if _outside_mode(eqn) == "drop":
             values = _fill_outside(graph, eqn, values, window)
         windows.append(values.reshape(window_shape))
     if not windows:
         return [arrays.zeros(aval)]
-    gathered = np.stack(windows).reshape([*indices.shape[:-1], *window_shape])
+    output = np.stack(windows).reshape([*indices.shape[:-1], *window_shape])
     # The axes of the windows lie behind those of the indices, and go where XLA has them.
     num_batch_axes = indices.ndim - 1
     sources = range(num_batch_axes, num_batch_axes + len(window_shape))
-    gathered = np.moveaxis(gathered, list(sources), list(dims.offset_dims))
-    return [arrays.settle(gathered, aval.dtype)]
+    output = np.moveaxis(output, list(sources), list(dims.offset_dims))
+    return [arrays.settle(output, aval.dtype)]
 
 
 def _fill_outside(graph: Graph, eqn: Equation, values: Array, window: Window) -> Array:
     """Replaces the values of a window that is outside by the fill value."""
     dtype = np.dtype(eqn.outvars[0].aval.dtype)
-    inside = np.bool_(window.inside)
+    is_inside = np.bool_(window.is_inside)
     for index, _, count in window.unknowns:
         low = graph.call("ge", index, index.dtype.type(0))
         high = graph.call("lt", index, index.dtype.type(count))
-        inside = graph.call("and", inside, graph.call("and", low, high))
+        is_inside = graph.call("and", is_inside, graph.call("and", low, high))
     value = eqn.params["fill_value"]
     if value is None:
         value = _default_fill(dtype)
     fill = dtype.type(value)
     return arrays.map_elements(
-        lambda x: graph.select(inside, x, fill), values.shape, object, values
+        lambda x: graph.select(is_inside, x, fill), values.shape, object, values
     )
 
 
@@ -175,14 +175,14 @@ def _scatter(graph: Graph, eqn: Equation, *operands: Array, combine: Callable) -
     operand, indices, updates = operands
     dims = eqn.params["dimension_numbers"]
     # Axes that the updates do not have, along which a window has the size 1.
-    hidden = {*dims.inserted_window_dims, *dims.operand_batching_dims}
+    hidden_dims = {*dims.inserted_window_dims, *dims.operand_batching_dims}
     window_axes = list(dims.update_window_dims)
     update_sizes = iter([updates.shape[axis] for axis in window_axes])
-    sizes = [1 if axis in hidden else next(update_sizes) for axis in range(operand.ndim)]
-    trailing = range(updates.ndim - len(window_axes), updates.ndim)
-    blocks = np.moveaxis(updates, window_axes, list(trailing))
+    sizes = [1 if axis in hidden_dims else next(update_sizes) for axis in range(operand.ndim)]
+    trailing_dims = range(updates.ndim - len(window_axes), updates.ndim)
+    blocks = np.moveaxis(updates, window_axes, list(trailing_dims))
     blocks = blocks.reshape([math.prod(indices.shape[:-1]), math.prod(sizes)])
-    flat = arrays.lift(operand).reshape(-1).copy()
+    cells = arrays.lift(operand).reshape(-1).copy()
     batching = (dims.operand_batching_dims, dims.scatter_indices_batching_dims)
     starts = _starts(indices, operand.ndim, dims.scatter_dims_to_operand_dims, *batching)
     # One after the other, as windows may overlap.
@@ -190,22 +190,22 @@ def _scatter(graph: Graph, eqn: Equation, *operands: Array, combine: Callable) -
         if _outside_mode(eqn) == "clip":
             start = _clip(graph, start, operand.shape, sizes)
         window = _window(operand.shape, sizes, start)
-        if window.inside:
-            _write_window(graph, flat, window, block, combine)
-    return [arrays.settle(flat.reshape(operand.shape), eqn.outvars[0].aval.dtype)]
+        if window.is_inside:
+            _write_window(graph, cells, window, block, combine)
+    return [arrays.settle(cells.reshape(operand.shape), eqn.outvars[0].aval.dtype)]
 
 
 def _clip(graph: Graph, starts: Sequence[Any], shape: Sequence[int], sizes: Sequence[int]) -> list:
     """Moves starts to the nearest place that keeps the window inside."""
-    clipped = []
+    corner = []
     for start, limit, size in zip(starts, shape, sizes, strict=True):
         if is_constant(start) or isinstance(start, int):
-            clipped.append(min(max(int(start), 0), limit - size))
+            corner.append(min(max(int(start), 0), limit - size))
         else:
             low = start.dtype.type(0)
             high = start.dtype.type(limit - size)
-            clipped.append(graph.call("min", graph.call("max", start, low), high))
-    return clipped
+            corner.append(graph.call("min", graph.call("max", start, low), high))
+    return corner
 
 
 def _dynamic_slice(graph: Graph, eqn: Equation, operand: Array, *starts: Array) -> Results:
@@ -219,14 +219,14 @@ def _dynamic_update_slice(
     graph: Graph, eqn: Equation, operand: Array, update: Array, *starts: Array
 ) -> Results:
     """Replaces a window, which XLA moves to the nearest place inside of the operand."""
-    clipped = _clip(graph, [s[()] for s in starts], operand.shape, update.shape)
-    flat = arrays.lift(operand).reshape(-1).copy()
-    _write_window(graph, flat, _window(operand.shape, update.shape, clipped), update, _replace)
-    return [arrays.settle(flat.reshape(operand.shape), eqn.outvars[0].aval.dtype)]
+    corner = _clip(graph, [s[()] for s in starts], operand.shape, update.shape)
+    cells = arrays.lift(operand).reshape(-1).copy()
+    _write_window(graph, cells, _window(operand.shape, update.shape, corner), update, _replace)
+    return [arrays.settle(cells.reshape(operand.shape), eqn.outvars[0].aval.dtype)]
 
 
-def _replace(graph: Graph, old: Any, new: Any) -> Any:
-    return new
+def _replace(graph: Graph, old_value: Any, new_value: Any) -> Any:
+    return new_value
 
 
 def _combining(name: str) -> Callable:

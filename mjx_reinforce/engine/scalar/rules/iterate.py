@@ -38,7 +38,7 @@ def iterate(
     length: int | None = None,
     active: int | None = None,
     xs: Sequence[list[Scalar]] = (),
-    unchanged: list[bool] | None = None,
+    is_kept: list[bool] | None = None,
 ) -> Loop:
     """Builds a loop.
 
@@ -54,25 +54,25 @@ def iterate(
       length: the number of iterations, or None for no limit.
       active: the position in the carry of the bool that ends the loop when no lane has it.
       xs: for each element, its value in each iteration.
-      unchanged: which of the carry keep their values, where that is known of the variables; then
+      is_kept: which of the carry keep their values, where that is known of the variables; then
         the others are assumed to vary.
     """
-    make = functools.partial(Loop, graph.scope, 0, length, list(inits), active, list(xs))
+    make_loop = functools.partial(Loop, graph.scope, 0, length, list(inits), active, list(xs))
     place = (graph.path, active)
     count = len(inits)
-    initial = Assumption(unchanged or [True] * count, [unchanged is not None] * count)
+    initial = Assumption(is_kept or [True] * count, [is_kept is not None] * count)
     fixed, varying = graph.findings.get(place, initial)
     varying = [v or varies(init) for v, init in zip(varying, inits, strict=True)]
     # Assumptions are only ever dropped, so this ends.
     while True:
-        loop = _trace_body(graph, step, make, fixed, varying)
-        moved = [f and not same(n, i) for f, n, i in zip(fixed, loop.nexts, inits, strict=True)]
-        differs = [varies(n) and not v for n, v in zip(loop.nexts, varying, strict=True)]
-        fixed = [f and not m for f, m in zip(fixed, moved, strict=True)]
-        varying = [v or d for v, d in zip(varying, differs, strict=True)]
+        loop = _trace_body(graph, step, make_loop, fixed, varying)
+        is_moved = [f and not same(n, i) for f, n, i in zip(fixed, loop.nexts, inits, strict=True)]
+        is_widened = [varies(n) and not v for n, v in zip(loop.nexts, varying, strict=True)]
+        fixed = [f and not m for f, m in zip(fixed, is_moved, strict=True)]
+        varying = [v or d for v, d in zip(varying, is_widened, strict=True)]
         # Whether lanes agree on a carry that keeps its value is decided by that value alone.
-        broken = [*moved, *(d and not f for d, f in zip(differs, fixed, strict=True))]
-        if not any(broken):
+        is_broken = [*is_moved, *(d and not f for d, f in zip(is_widened, fixed, strict=True))]
+        if not any(is_broken):
             graph.findings[place] = Assumption(fixed, varying)
             return _close(graph, loop, varying)
 
@@ -85,13 +85,13 @@ def varies(scalar: Scalar) -> bool:
 def _trace_body(
     graph: Graph,
     step: Iteration,
-    make: Callable[[Scope], Loop],
+    make_loop: Callable[[Scope], Loop],
     fixed: list[bool],
     varying: list[bool],
 ) -> Loop:
     """Evaluates one iteration under the present assumptions."""
     with graph.loop_body() as body:
-        loop = make(body)
+        loop = make_loop(body)
         # What is the same in every iteration has no leaf: it folds and simplifies as it is.
         state = []
         for i, (init, is_fixed, v) in enumerate(zip(loop.inits, fixed, varying, strict=True)):
@@ -128,8 +128,8 @@ def _close(graph: Graph, loop: Loop, varying: list[bool]) -> Loop:
         leaves = []
         # What lies outside of the body is the same in every iteration, and needs no leaves.
         if isinstance(y, Node) and y.scope is loop.body:
-            times = range(loop.length or 0)
-            leaves = [graph.leaf(y.dtype, y.varying, loop, ("y", j, t)) for t in times]
+            iterations = range(loop.length or 0)
+            leaves = [graph.leaf(y.dtype, y.varying, loop, ("y", j, t)) for t in iterations]
         loop.stacked.append(leaves)
     return loop
 
@@ -180,8 +180,8 @@ def _operands_returned(eqn: Any) -> list[int | None]:
         # Among the body's arguments, the carry comes behind the body's constants. Among the
         # equation's operands, it comes behind those of the condition, too.
         start = params["body_nconsts"]
-        unchanged = keeps(jaxprs.program(params["body_jaxpr"]), start, len(eqn.outvars))
-        return _where_kept(unchanged, params["cond_nconsts"] + start)
+        is_kept = keeps(jaxprs.program(params["body_jaxpr"]), start, len(eqn.outvars))
+        return _where_kept(is_kept, params["cond_nconsts"] + start)
     if name == "cond":
         # All branches must return the same argument. The first operand is the number of the branch.
         positions: list[int | None] = []
@@ -198,6 +198,6 @@ def _operands_returned(eqn: Any) -> list[int | None]:
     return list(_sources(program))
 
 
-def _where_kept(unchanged: list[bool], start: int) -> list[int | None]:
+def _where_kept(is_kept: list[bool], start: int) -> list[int | None]:
     """Returns the position of each carry that keeps its value, the first at ``start``."""
-    return [start + k if keeps_value else None for k, keeps_value in enumerate(unchanged)]
+    return [start + k if keeps_value else None for k, keeps_value in enumerate(is_kept)]

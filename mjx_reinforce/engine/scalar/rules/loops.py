@@ -43,22 +43,22 @@ def while_rule(graph: Graph, run: Callable, eqn: Equation, live: Any, *operands:
 
     def step(state: list[Scalar], _: list[Scalar]) -> tuple[list[Scalar], list[Scalar]]:
         """Computes one iteration; whether a lane goes on is the first of the carry."""
-        active, *old = state
-        new = carry.unpack(run(body, [*body_consts, *carry.pack(old)]))
+        active, *carries = state
+        nexts = carry.unpack(run(body, [*body_consts, *carry.pack(carries)]))
         # Lanes that share the predicate are done all at once: no iteration runs then.
         if varies(active):
-            new = [graph.select(active, n, o) for n, o in zip(new, old, strict=True)]
-            return [graph.call("and", active, goes_on(new)), *new], []
-        return [goes_on(new), *new], []
+            nexts = [graph.select(active, n, o) for n, o in zip(nexts, carries, strict=True)]
+            return [graph.call("and", active, goes_on(nexts)), *nexts], []
+        return [goes_on(nexts), *nexts], []
 
     start = carry.unpack(operands[num_cond + num_body :])
     active = goes_on(start)
     if is_constant(active) and not active:
         return carry.pack(start)
-    unchanged = None
+    is_kept = None
     if iterate.has_loops(body) or iterate.has_loops(cond):
-        unchanged = [False, *carry.repeat(iterate.keeps(body, num_body, len(eqn.outvars)))]
-    loop = iterate.iterate(graph, step, [active, *start], active=0, unchanged=unchanged)
+        is_kept = [False, *carry.repeat(iterate.keeps(body, num_body, len(eqn.outvars)))]
+    loop = iterate.iterate(graph, step, [active, *start], active=0, is_kept=is_kept)
     return carry.pack(loop.results()[0][1:])
 
 
@@ -67,40 +67,40 @@ def scan_rule(graph: Graph, run: Callable, eqn: Equation, live: Any, *operands: 
     length = eqn.params["length"]
     num_consts, num_carry = jaxprs.scan_parts(eqn)
     body = jaxprs.program(eqn.params["jaxpr"])
-    split = num_consts + num_carry
+    num_fixed = num_consts + num_carry
     consts = operands[:num_consts]
-    init = operands[num_consts:split]
+    init = operands[num_consts:num_fixed]
     carry = arrays.Layout([out.aval for out in eqn.outvars[:num_carry]])
-    outs = arrays.Layout([out.aval for out in body.jaxpr.outvars[num_carry:]])
-    ins = arrays.Layout([var.aval for var in body.jaxpr.invars[split:]])
+    out_layout = arrays.Layout([out.aval for out in body.jaxpr.outvars[num_carry:]])
+    in_layout = arrays.Layout([var.aval for var in body.jaxpr.invars[num_fixed:]])
     order = range(length)
     if eqn.params["reverse"]:
         order = order[::-1]
 
     def step(state: list[Scalar], row: list[Scalar]) -> tuple[list[Scalar], list[Scalar]]:
-        results = run(body, [*consts, *carry.pack(state), *ins.pack(row)])
-        return carry.unpack(results[:num_carry]), outs.unpack(results[num_carry:])
+        row_outputs = run(body, [*consts, *carry.pack(state), *in_layout.pack(row)])
+        return carry.unpack(row_outputs[:num_carry]), out_layout.unpack(row_outputs[num_carry:])
 
-    rows = [ins.unpack([x[t : t + 1] for x in operands[split:]]) for t in order]
+    rows = [in_layout.unpack([x[t : t + 1] for x in operands[num_fixed:]]) for t in order]
     # Rows and the table of ys are in the order of the iterations.
     if length <= max(graph.scans, eqn.params["unroll"]):
-        final = carry.unpack(init)
-        table = []
+        final_carry = carry.unpack(init)
+        output_rows = []
         for row in rows:
-            final, ys = step(final, row)
-            table.append(ys)
+            final_carry, ys = step(final_carry, row)
+            output_rows.append(ys)
     else:
-        unchanged = None
+        is_kept = None
         if iterate.has_loops(body):
-            unchanged = carry.repeat(iterate.keeps(body, num_consts, num_carry))
-        final, table = _as_loop(graph, step, carry.unpack(init), rows, length, unchanged)
+            is_kept = carry.repeat(iterate.keeps(body, num_consts, num_carry))
+        final_carry, output_rows = _as_loop(graph, step, carry.unpack(init), rows, length, is_kept)
     if eqn.params["reverse"]:
-        table = table[::-1]
-    stacked = [outs.pack(row) for row in table]
-    ys = [np.stack(arrays.together(column)) for column in zip(*stacked, strict=True)]
-    if not table:
+        output_rows = output_rows[::-1]
+    outputs = [out_layout.pack(row) for row in output_rows]
+    ys = [np.stack(arrays.together(column)) for column in zip(*outputs, strict=True)]
+    if not output_rows:
         ys = [arrays.zeros(out.aval) for out in eqn.outvars[num_carry:]]
-    return [*carry.pack(final), *ys]
+    return [*carry.pack(final_carry), *ys]
 
 
 def _as_loop(
@@ -109,20 +109,20 @@ def _as_loop(
     inits: list,
     rows: list[list[Scalar]],
     length: int,
-    unchanged: list[bool] | None,
+    is_kept: list[bool] | None,
 ) -> tuple[list, list]:
     """Builds a scan's loop; returns the final carry and the ys of each iteration."""
     xs = [list(column) for column in zip(*rows, strict=True)]
-    loop = iterate.iterate(graph, step, inits, length=length, xs=xs, unchanged=unchanged)
+    loop = iterate.iterate(graph, step, inits, length=length, xs=xs, is_kept=is_kept)
     # A loop may end early if it neither reads rows nor makes ys: further iterations leave nothing.
     if not xs and not loop.ys:
         switch = _switch(loop)
         if switch is not None:
             loop = iterate.iterate(
-                graph, step, inits, length=length, active=switch, unchanged=unchanged
+                graph, step, inits, length=length, active=switch, is_kept=is_kept
             )
-    final, columns = loop.results()
-    return final, [list(row) for row in zip(*columns, strict=True)] or [[]] * length
+    final_carry, columns = loop.results()
+    return final_carry, [list(row) for row in zip(*columns, strict=True)] or [[]] * length
 
 
 def _switch(loop: Loop) -> int | None:
@@ -130,15 +130,15 @@ def _switch(loop: Loop) -> int | None:
 
     MJX's line search is such a scan: its body is cond(active, iterate, identity).
     """
-    changing = [i for i, carry in enumerate(loop.carries) if carry is not None]
-    for i in changing:
+    indices = [i for i, carry in enumerate(loop.carries) if carry is not None]
+    for i in indices:
         switch = loop.carries[i]
         if switch is None or switch.dtype != np.bool_:
             continue
         # What the carry is after an iteration where the switch is off, and what it was before.
-        after = [_when_false(loop.nexts[k], switch) for k in changing]
-        before = [np.False_ if k == i else loop.carries[k] for k in changing]
-        if all(map(same, after, before)):
+        next_flags = [_when_false(loop.nexts[k], switch) for k in indices]
+        flags = [np.False_ if k == i else loop.carries[k] for k in indices]
+        if all(map(same, next_flags, flags)):
             return i
     return None
 
@@ -189,85 +189,85 @@ def cond_rule(
     programs = [jaxprs.program(branch) for branch in eqn.params["branches"]]
     (choice,) = arrays.elements(index)
     if is_constant(choice):
-        nearest = min(max(int(choice), 0), len(programs) - 1)
-        return run(programs[nearest], arguments, live)
-    layout = arrays.Layout([out.aval for out in eqn.outvars])
+        branch_index = min(max(int(choice), 0), len(programs) - 1)
+        return run(programs[branch_index], arguments, live)
+    out_layout = arrays.Layout([out.aval for out in eqn.outvars])
 
     def branch(program: jaxprs.Program) -> Branch:
-        return lambda: layout.unpack(run(program, arguments, live))
+        return lambda: out_layout.unpack(run(program, arguments, live))
 
-    return layout.pack(_choose_among(graph, [branch(program) for program in programs], choice))
+    return out_layout.pack(_choose_among(graph, [branch(program) for program in programs], choice))
 
 
 def skippable_rule(
     graph: Graph, run: Callable, eqn: Equation, live: list[bool], *operands: Array
 ) -> Results:
     """Skips a computation that no lane needs, if it is expensive; see ``skippable``."""
-    needed, *leaves = operands
+    is_needed, *leaves = operands
     count = eqn.params["num_results"]
-    otherwise = leaves[:count]
+    default = leaves[:count]
     consts = leaves[count:]
-    layout = arrays.Layout([out.aval for out in eqn.outvars])
+    out_layout = arrays.Layout([out.aval for out in eqn.outvars])
 
     def compute() -> list[Scalar]:
-        return layout.unpack(run(jaxprs.program(eqn.params["computation"]), consts, live))
+        return out_layout.unpack(run(jaxprs.program(eqn.params["computation"]), consts, live))
 
-    (predicate,) = arrays.elements(needed)
+    (predicate,) = arrays.elements(is_needed)
     if is_constant(predicate) and not predicate:
-        return otherwise
+        return default
     body = _expensive(graph, compute, 0, predicate)
     if body is None:
-        return layout.pack(compute())
-    # In a lane that does not need it the result equals ``otherwise``, so nothing is selected.
-    return layout.pack(_close(graph, body, predicate, body.results, layout.unpack(otherwise)))
+        return out_layout.pack(compute())
+    # In a lane that does not need it the result equals ``default``, so nothing is selected.
+    return out_layout.pack(_close(graph, body, predicate, body.results, out_layout.unpack(default)))
 
 
 def whole_rule(
     graph: Graph, run: Callable, eqn: Equation, live: list[bool], *operands: Array
 ) -> Results:
     """Keeps an operation whole; see ``whole``."""
-    fields = tuple(field for field, *_ in eqn.params["results"])
+    field_names = tuple(field for field, *_ in eqn.params["results"])
     args = [arrays.elements(x) for x in operands]
-    call = Call(graph.scope, graph.number(), eqn.params["name"], args, fields)
-    results = []
-    for number, (out, is_live) in enumerate(zip(eqn.outvars, live, strict=True)):
+    call = Call(graph.scope, graph.number(), eqn.params["name"], args, field_names)
+    outputs = []
+    for index, (out, is_live) in enumerate(zip(eqn.outvars, live, strict=True)):
         # A result that nothing reads has no leaves, and the backend need not store it.
         leaves = []
-        array = arrays.zeros(out.aval)
+        leaf = arrays.zeros(out.aval)
         if is_live:
-            places = [(number, k) for k in range(num_entries(out.aval))]
+            places = [(index, k) for k in range(num_entries(out.aval))]
             leaves = [graph.leaf(out.aval.dtype, True, call, place) for place in places]
-            array = arrays.pack(leaves, out.aval.shape, out.aval.dtype)
+            leaf = arrays.pack(leaves, out.aval.shape, out.aval.dtype)
         call.outs.append(leaves)
-        results.append(array)
-    return results
+        outputs.append(leaf)
+    return outputs
 
 
 def _choose_among(graph: Graph, branches: list[Branch], choice: Node) -> list[Scalar]:
     """Returns the results of the branch that each lane takes."""
-    needed = [_takes(graph, choice, k, len(branches)) for k in range(len(branches))]
+    flags = [_takes(graph, choice, k, len(branches)) for k in range(len(branches))]
     order = list(range(len(branches)))
     bodies = {}
     if len(branches) == 2:
-        bodies[0] = _expensive(graph, branches[0], 0, needed[0])
+        bodies[0] = _expensive(graph, branches[0], 0, flags[0])
         # The cheap branch comes first: its results are what a skipped one falls back on.
         if bodies[0] is not None:
             order = [1, 0]
-    results: list[Scalar] | None = None
+    selection: list[Scalar] | None = None
     for k in order:
         if k not in bodies:
-            bodies[k] = _expensive(graph, branches[k], k, needed[k])
+            bodies[k] = _expensive(graph, branches[k], k, flags[k])
         body = bodies[k]
         if body is not None:
-            results = _gate(graph, body, needed[k], results)
+            selection = _gate(graph, body, flags[k], selection)
             continue
         # Every lane computes a cheap branch. The first of all branches needs no selection: each
         # lane that takes another one overwrites it.
         branch_results = branches[k]()
-        if results is not None:
-            branch_results = _select_all(graph, needed[k], branch_results, results)
-        results = branch_results
-    return results or []
+        if selection is not None:
+            branch_results = _select_all(graph, flags[k], branch_results, selection)
+        selection = branch_results
+    return selection or []
 
 
 def _takes(graph: Graph, choice: Node, k: int, count: int) -> Scalar:
@@ -284,48 +284,48 @@ def _takes(graph: Graph, choice: Node, k: int, count: int) -> Scalar:
     return graph.call("eq", choice, number(k))
 
 
-def _expensive(graph: Graph, branch: Branch, k: int, needed: Scalar) -> _Body | None:
+def _expensive(graph: Graph, branch: Branch, k: int, flag: Scalar) -> _Body | None:
     """Evaluates branch k where it may be skipped; returns None if it need not be.
 
     What a cheap branch makes is dropped. A branch that was expensive once remains so where less is
     assumed.
     """
     # A premise holds for some lane wherever this code runs: such a branch is never skipped.
-    if not isinstance(needed, Node) or needed in graph.premises:
+    if not isinstance(flag, Node) or flag in graph.premises:
         return None
-    with graph.branch() as scope, graph.assuming(needed):
-        results = branch()
+    with graph.branch() as scope, graph.assuming(flag):
+        outputs = branch()
     place = (graph.path, "expensive", k)
     if place not in graph.findings:
         if not scope.has_loop and scope.cost <= graph.branch_cost:
             return None
         graph.findings[place] = True
-    return _Body(scope, results)
+    return _Body(scope, outputs)
 
 
-def _gate(graph: Graph, body: _Body, needed: Node, fallback: list[Scalar] | None) -> list[Scalar]:
+def _gate(graph: Graph, body: _Body, flag: Node, fallback: list[Scalar] | None) -> list[Scalar]:
     """Makes an expensive branch one that is skipped where no lane needs it."""
     # Without a fallback any value does: where the branch is skipped, no lane takes it.
-    cold = fallback or [value.dtype.type(0) for value in body.results]
+    cold_values = fallback or [value.dtype.type(0) for value in body.results]
     # Inside of the branch, so that a skipped one selects nothing either.
-    with graph.again(body.scope), graph.assuming(needed):
-        hot = _select_all(graph, needed, body.results, cold)
-    return _close(graph, body, needed, hot, cold)
+    with graph.again(body.scope), graph.assuming(flag):
+        hot_values = _select_all(graph, flag, body.results, cold_values)
+    return _close(graph, body, flag, hot_values, cold_values)
 
 
 def _close(
-    graph: Graph, body: _Body, needed: Node, hot: list[Scalar], cold: list[Scalar]
+    graph: Graph, body: _Body, flag: Node, hot_values: list[Scalar], cold_values: list[Scalar]
 ) -> list[Scalar]:
     """Gives a branch its place; returns its results."""
-    gate = Gate(graph.scope, graph.number(), needed, body.scope, hot, cold)
-    for position, (on, off) in enumerate(zip(hot, cold, strict=True)):
-        varying = any(isinstance(value, Node) and value.varying for value in (on, off))
+    gate = Gate(graph.scope, graph.number(), flag, body.scope, hot_values, cold_values)
+    for position, (hot, cold) in enumerate(zip(hot_values, cold_values, strict=True)):
+        varying = any(isinstance(value, Node) and value.varying for value in (hot, cold))
         leaf = None
-        if not same(on, off):
-            leaf = graph.leaf(on.dtype, varying, gate, position)
+        if not same(hot, cold):
+            leaf = graph.leaf(hot.dtype, varying, gate, position)
         gate.outs.append(leaf)
-    return [off if out is None else out for out, off in zip(gate.outs, cold, strict=True)]
+    return [cold if out is None else out for out, cold in zip(gate.outs, cold_values, strict=True)]
 
 
-def _select_all(graph: Graph, needed: Scalar, on: list[Scalar], off: list[Scalar]) -> list[Scalar]:
-    return [graph.select(needed, x, y) for x, y in zip(on, off, strict=True)]
+def _select_all(graph: Graph, mask: Scalar, hot: list[Scalar], cold: list[Scalar]) -> list[Scalar]:
+    return [graph.select(mask, x, y) for x, y in zip(hot, cold, strict=True)]

@@ -14,17 +14,17 @@ from mjx_reinforce.engine.scalar.graph import Graph
 from mjx_reinforce.engine.scalar.jaxprs import Equation
 
 
-def _reduce(graph: Graph, eqn: Equation, x: Array, *, combine: str, empty: float) -> list:
+def _reduce(graph: Graph, eqn: Equation, x: Array, *, combine: str, identity: float) -> list:
     """Combines the elements along some axes, from the first to the last."""
     axes = tuple(eqn.params["axes"])
     aval = eqn.outvars[0].aval
     if x.size == 0:
-        return [np.full(aval.shape, empty, aval.dtype)]
-    free = [axis for axis in range(x.ndim) if axis not in axes]
-    rows = x.transpose([*free, *axes]).reshape([int(np.prod(aval.shape, dtype=int)), -1])
+        return [np.full(aval.shape, identity, aval.dtype)]
+    free_axes = [axis for axis in range(x.ndim) if axis not in axes]
+    rows = x.transpose([*free_axes, *axes]).reshape([int(np.prod(aval.shape, dtype=int)), -1])
     function = functools.partial(graph.call, combine)
-    reduced = (functools.reduce(function, arrays.elements(row)) for row in rows)
-    return [arrays.pack(reduced, aval.shape, aval.dtype)]
+    reductions = (functools.reduce(function, arrays.elements(row)) for row in rows)
+    return [arrays.pack(reductions, aval.shape, aval.dtype)]
 
 
 def _cumulate(graph: Graph, eqn: Equation, x: Array, *, combine: str) -> list:
@@ -38,25 +38,25 @@ def _cumulate(graph: Graph, eqn: Equation, x: Array, *, combine: str) -> list:
     return [arrays.settle(lines, eqn.outvars[0].aval.dtype)]
 
 
-def _arg_extreme(graph: Graph, eqn: Equation, x: Array, *, better: str) -> Results:
+def _arg_extreme(graph: Graph, eqn: Equation, x: Array, *, order: str) -> Results:
     """The position of the first extreme element; the first NaN counts as extreme."""
     (axis,) = eqn.params["axes"]
     aval = eqn.outvars[0].aval
     rows = np.moveaxis(x, axis, -1).reshape(-1, x.shape[axis])
-    positions = [_first_extreme(graph, arrays.elements(row), better, aval.dtype) for row in rows]
+    positions = [_first_extreme(graph, arrays.elements(row), order, aval.dtype) for row in rows]
     return [arrays.pack(positions, aval.shape, aval.dtype)]
 
 
-def _first_extreme(graph: Graph, row: list, better: str, dtype: np.dtype) -> Any:
+def _first_extreme(graph: Graph, row: list, order: str, dtype: np.dtype) -> Any:
     """Returns the position in a row of the element that is better than all others."""
-    best = row[0]
+    peak = row[0]
     position = dtype.type(0)
     for i, value in enumerate(row[1:], 1):
         # A NaN wins against numbers, and nothing wins against it: best == best is false for it.
-        wins = graph.call("or", graph.call(better, value, best), graph.call("ne", value, value))
-        wins = graph.call("and", wins, graph.call("eq", best, best))
-        best = graph.select(wins, value, best)
-        position = graph.select(wins, dtype.type(i), position)
+        is_peak = graph.call("or", graph.call(order, value, peak), graph.call("ne", value, value))
+        is_peak = graph.call("and", is_peak, graph.call("eq", peak, peak))
+        peak = graph.select(is_peak, value, peak)
+        position = graph.select(is_peak, dtype.type(i), position)
     return position
 
 
@@ -85,8 +85,8 @@ def _exchange(graph: Graph, lines: Any, i: int, num_keys: int) -> None:
     for line in reversed(lines[:num_keys]):
         is_less = _precedes(graph, line[i + 1], line[i])
         is_greater = _precedes(graph, line[i], line[i + 1])
-        equal = graph.call("not", graph.call("or", is_less, is_greater))
-        swap = graph.call("or", is_less, graph.call("and", equal, swap))
+        is_equal = graph.call("not", graph.call("or", is_less, is_greater))
+        swap = graph.call("or", is_less, graph.call("and", is_equal, swap))
     for line in lines:
         low = line[i]
         high = line[i + 1]
@@ -101,8 +101,8 @@ def _precedes(graph: Graph, x: Any, y: Any) -> Any:
     return graph.call("or", graph.call("lt", x, y), graph.call("and", is_number, is_nan))
 
 
-def _reducer(combine: str, empty: float) -> Callable:
-    return functools.partial(_reduce, combine=combine, empty=empty)
+def _reducer(combine: str, identity: float) -> Callable:
+    return functools.partial(_reduce, combine=combine, identity=identity)
 
 
 def _dot_general(graph: Graph, eqn: Equation, x: Array, y: Array) -> Results:
@@ -126,12 +126,12 @@ def _cast(graph: Graph, aval: jaxprs.Shape, x: Array, dtype: DTypeLike) -> Array
     return arrays.map_elements(lambda value: graph.convert(value, dtype), x.shape, dtype, x)
 
 
-def _as_matrices(x: Array, batch: tuple, contracted: tuple) -> Array:
+def _as_matrices(x: Array, batch: tuple, sum_axes: tuple) -> Array:
     """Returns x as [batch, free, contracted]."""
-    free = [axis for axis in range(x.ndim) if axis not in (*batch, *contracted)]
-    groups = [[x.shape[axis] for axis in axes] for axes in (batch, free, contracted)]
+    free_axes = [axis for axis in range(x.ndim) if axis not in (*batch, *sum_axes)]
+    groups = [[x.shape[axis] for axis in axes] for axes in (batch, free_axes, sum_axes)]
     sizes = [int(np.prod(group, dtype=int)) for group in groups]
-    return x.transpose([*batch, *free, *contracted]).reshape(sizes)
+    return x.transpose([*batch, *free_axes, *sum_axes]).reshape(sizes)
 
 
 def _dot(graph: Graph, x: list, y: list, dtype: DTypeLike) -> Any:
@@ -188,13 +188,13 @@ def _triangular_solve(graph: Graph, eqn: Equation, a: Array, b: Array) -> Result
     *batch, size, columns = b.shape
     matrices = a.reshape(-1, size, size)
     blocks = b.reshape(-1, size, columns)
-    solved = [
+    solutions = [
         _substitute(graph, matrix, column, lower, params["unit_diagonal"])
         for matrix, block in zip(matrices, blocks, strict=True)
         for column in block.T
     ]
     # Its rows are the solved columns: those of x, or of x' where the equation was transposed.
-    x = arrays.pack(itertools.chain(*solved), (*batch, columns, size), aval.dtype)
+    x = arrays.pack(itertools.chain(*solutions), (*batch, columns, size), aval.dtype)
     if params["left_side"]:
         x = np.swapaxes(x, -1, -2)
     return [x]
@@ -208,8 +208,8 @@ def _substitute(graph: Graph, matrix: Array, rhs: Any, lower: bool, unit: bool) 
     # Each unknown needs those before it in a lower matrix, those behind it in an upper one.
     order = range(size) if lower else range(size - 1, -1, -1)
     for i in order:
-        solved = slice(0, i) if lower else slice(i + 1, size)
-        value = _minus_dot(graph, solution[i], list(matrix[i, solved]), solution[solved])
+        known_rows = slice(0, i) if lower else slice(i + 1, size)
+        value = _minus_dot(graph, solution[i], list(matrix[i, known_rows]), solution[known_rows])
         if not unit:
             value = _divided(graph, value, matrix[i, i])
         solution[i] = value
@@ -228,8 +228,8 @@ RULES = {
     "cumprod": functools.partial(_cumulate, combine="mul"),
     "cummax": functools.partial(_cumulate, combine="max"),
     "cummin": functools.partial(_cumulate, combine="min"),
-    "argmax": functools.partial(_arg_extreme, better="gt"),
-    "argmin": functools.partial(_arg_extreme, better="lt"),
+    "argmax": functools.partial(_arg_extreme, order="gt"),
+    "argmin": functools.partial(_arg_extreme, order="lt"),
     "sort": _sort,
     "dot_general": _dot_general,
     "cholesky": _cholesky,

@@ -9,7 +9,7 @@ from mjx_reinforce.engine.scalar import arrays, jaxprs
 from mjx_reinforce.engine.scalar.arrays import Array, Results
 from mjx_reinforce.engine.scalar.graph import Graph
 from mjx_reinforce.engine.scalar.jaxprs import Equation
-from mjx_reinforce.engine.scalar.nodes import FACTS, Op, conversion
+from mjx_reinforce.engine.scalar.nodes import OP_TRAITS, Op, conversion
 from mjx_reinforce.engine.scalar.passes import simplify
 
 
@@ -22,10 +22,10 @@ def _slice(graph: Graph, eqn: Equation, x: Array) -> Results:
 
 def _broadcast_in_dim(graph: Graph, eqn: Equation, x: Array) -> Results:
     shape = eqn.params["shape"]
-    aligned = [1] * len(shape)
+    aligned_shape = [1] * len(shape)
     for axis, target in enumerate(eqn.params["broadcast_dimensions"]):
-        aligned[target] = x.shape[axis]
-    return [np.broadcast_to(x.reshape(aligned), shape)]
+        aligned_shape[target] = x.shape[axis]
+    return [np.broadcast_to(x.reshape(aligned_shape), shape)]
 
 
 def _unstack(graph: Graph, eqn: Equation, x: Array) -> Results:
@@ -34,15 +34,15 @@ def _unstack(graph: Graph, eqn: Equation, x: Array) -> Results:
 
 
 def _split(graph: Graph, eqn: Equation, x: Array) -> Results:
-    ends = np.cumsum(eqn.params["sizes"])[:-1]
-    return list(np.split(x, ends, eqn.params["axis"]))
+    bounds = np.cumsum(eqn.params["sizes"])[:-1]
+    return list(np.split(x, bounds, eqn.params["axis"]))
 
 
 def _pad(graph: Graph, eqn: Equation, x: Array, value: Array) -> Results:
     """Writes x, spread by the interior padding, into an array of the value."""
     x, value = arrays.together([x, value])
     shape = eqn.outvars[0].aval.shape
-    padded = np.broadcast_to(value, shape).copy()
+    output = np.broadcast_to(value, shape).copy()
     target = []
     origin = []
     for size, limit, (low, _, interior) in zip(
@@ -53,8 +53,8 @@ def _pad(graph: Graph, eqn: Equation, x: Array, value: Array) -> Results:
         is_inside = (places >= 0) & (places < limit)
         target.append(places[is_inside])
         origin.append(np.flatnonzero(is_inside))
-    padded[np.ix_(*target)] = x[np.ix_(*origin)]
-    return [padded]
+    output[np.ix_(*target)] = x[np.ix_(*origin)]
+    return [output]
 
 
 def _iota(graph: Graph, eqn: Equation) -> Results:
@@ -62,9 +62,9 @@ def _iota(graph: Graph, eqn: Equation) -> Results:
     aval = eqn.outvars[0].aval
     axis = eqn.params["dimension"]
     line = np.arange(aval.shape[axis]).astype(aval.dtype)
-    aligned = [1] * len(aval.shape)
-    aligned[axis] = -1
-    return [np.broadcast_to(line.reshape(aligned), aval.shape)]
+    aligned_shape = [1] * len(aval.shape)
+    aligned_shape[axis] = -1
+    return [np.broadcast_to(line.reshape(aligned_shape), aval.shape)]
 
 
 def _platform_index(graph: Graph, eqn: Equation) -> Results:
@@ -90,7 +90,7 @@ def _elementwise(graph: Graph, eqn: Equation, *operands: Array) -> Results:
     """The general rule: the operation has the primitive's name."""
     name = eqn.primitive.name
     params = ()
-    if FACTS[name].has_params:
+    if OP_TRAITS[name].has_params:
         params = tuple(sorted(eqn.params.items()))
     return [_map_op(graph, Op(name, params), eqn.outvars[0].aval, operands)]
 
@@ -121,8 +121,8 @@ def _bitcast(graph: Graph, eqn: Equation, x: Array) -> Results:
 
 def _clamp(graph: Graph, eqn: Equation, low: Array, x: Array, high: Array) -> Results:
     aval = eqn.outvars[0].aval
-    raised = _map_op(graph, Op("max"), aval, (x, low))
-    return [_map_op(graph, Op("min"), aval, (raised, high))]
+    lower_bounded = _map_op(graph, Op("max"), aval, (x, low))
+    return [_map_op(graph, Op("min"), aval, (lower_bounded, high))]
 
 
 def _integer_pow(graph: Graph, eqn: Equation, x: Array) -> Results:
@@ -159,7 +159,7 @@ RULES = {
     "iota": _iota,
     "empty": _moved(lambda _, aval: arrays.zeros(aval)),
     "platform_index": _platform_index,
-    **dict.fromkeys(FACTS, _elementwise),
+    **dict.fromkeys(OP_TRAITS, _elementwise),
     "convert_element_type": _convert,
     "bitcast_convert_type": _bitcast,
     "add_any": lambda graph, eqn, x, y: [_map_op(graph, Op("add"), eqn.outvars[0].aval, (x, y))],

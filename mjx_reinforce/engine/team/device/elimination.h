@@ -1,4 +1,4 @@
-// The Newton step: a symmetric system of equations, a row a lane.
+// The Newton step: a symmetric system of equations, its rows dealt to the lanes in turn.
 #pragma once
 
 // Solves H p = right (MuJoCo factors H, mju_cholFactor) by elimination of two columns at a time,
@@ -16,6 +16,8 @@ DEV void solve(const Team& t, State& s, real (&h)[ROWS_A_LANE][SIDE], real (&p)[
       }
     }
     t.sync();
+    // Multipliers u, w of columns m and m + 1: the 2 x 2 pivot inverted, times this lane's rows. Row
+    // r of the lane is row i = lane + r W of H; i == SIDE is the right side.
     const real corner = first[m + 1], inverse = 1 / first[m], ratio = corner * inverse;
     const real last = 1 / (second[m + 1] - ratio * corner);
     real u[ROWS_A_LANE], w[ROWS_A_LANE];
