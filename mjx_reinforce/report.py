@@ -22,7 +22,7 @@ from mjx_reinforce.reports.findings import Findings, compute_findings, swept, wo
 from mjx_reinforce.settings.config import code_flags
 from mjx_reinforce.settings.flags import run_command
 from mjx_reinforce.setup.provenance import version
-from mjx_reinforce.training.resume import BEGUN
+from mjx_reinforce.training.resume import FIRST_FILES
 
 #: How the names of pages end.
 _PAGES = (".html", ".htm")
@@ -153,7 +153,7 @@ def _write(experiment: Experiment, output: Path) -> WrittenReport:
 def _beside(output: Path) -> Path:
     """Returns the folder for a page's pictures and tables, which is none that has runs."""
     beside = output.with_suffix("")
-    while any(path for name in BEGUN for path in beside.rglob(name)):
+    while any(path for name in FIRST_FILES for path in beside.rglob(name)):
         beside = beside.with_name(f"{beside.name}-report")
     return beside
 
@@ -162,7 +162,7 @@ def _is_report(path: Path) -> bool:
     """Returns whether a path is a page, or the folder of its pictures and tables."""
     page = path.suffix.lower() in _PAGES and path.is_file()
     return page or (
-        (path / "results.csv").is_file() and not any((path / x).exists() for x in BEGUN)
+        (path / "results.csv").is_file() and not any((path / x).exists() for x in FIRST_FILES)
     )
 
 

@@ -78,7 +78,7 @@ class Display(Observer[RunDriver]):
         """Leaves the last state on the screen."""
         self._bar.stop()
 
-    def say(self, text: str | Table, style: str | None = None, *, whole: bool = False) -> None:
+    def say(self, text: str | Table, style: str | None = None, *, is_whole: bool = False) -> None:
         """Prints a sentence or a table above the bar.
 
         A line that the screen does not take is lost: it may be a file on a full disk, or a pipe
@@ -87,11 +87,11 @@ class Display(Observer[RunDriver]):
         Args:
           text: is wrapped on a terminal, and a line elsewhere.
           style: one of rich's.
-          whole: wrap it nowhere: it is to be copied.
+          is_whole: wrap it nowhere: it is to be copied.
         """
         with suppress(OSError):
-            whole |= not self.console.is_terminal
-            self.console.print(text, style=style, highlight=False, soft_wrap=whole)
+            is_whole |= not self.console.is_terminal
+            self.console.print(text, style=style, highlight=False, soft_wrap=is_whole)
 
     def warn_of_model(self, instability: str | None) -> None:
         """Says that a model explodes in C MuJoCo, now and where its run is stopped."""
@@ -101,8 +101,8 @@ class Display(Observer[RunDriver]):
 
     def show_commands(self, commands: Mapping[str, str]) -> None:
         """Prints command lines after what they do; each is one line, to be copied."""
-        for purpose, line in commands.items():
-            self.say(f"{purpose}:  {line}", whole=True)
+        for purpose, command_line in commands.items():
+            self.say(f"{purpose}:  {command_line}", is_whole=True)
 
     def show_summary(
         self, summary: dict[str, Any], directory: Path, resume_flags: str = "", play_flags: str = ""
@@ -117,15 +117,17 @@ class Display(Observer[RunDriver]):
         """
         self.say(summary_table(summary))
         # In commands that are to be copied the path is quoted for the shell, elsewhere as it is.
-        quoted = shlex.quote(str(directory))
+        quoted_directory = shlex.quote(str(directory))
         if summary["status"] == "interrupted":
-            self.say(f"Interrupted: go on with --resume {quoted}{resume_flags}", whole=True)
+            self.say(
+                f"Interrupted: go on with --resume {quoted_directory}{resume_flags}", is_whole=True
+            )
             return
         self.say(f"Files in {directory}; the picture is learning_curve.png.")
         self.show_commands(
             {
-                "To see the best seed play": f"{command('watch')} {quoted}{play_flags}",
-                "For a page of all figures": f"{command('report')} {quoted}",
+                "To see the best seed play": f"{command('watch')} {quoted_directory}{play_flags}",
+                "For a page of all figures": f"{command('report')} {quoted_directory}",
             }
         )
         if summary["status"] == "stopped":
@@ -157,12 +159,14 @@ class Display(Observer[RunDriver]):
                 f"{returns_and_speed}  {percent}  {time_left}".rstrip()
             )
 
-    def updated(self, driver: RunDriver, met: np.ndarray) -> None:
+    def updated(self, driver: RunDriver, num_nonfinite: np.ndarray) -> None:
         """Says once which seeds met numbers that are not finite; the last table counts them."""
-        if met.any() and not self._nonfinite_shown:
+        if num_nonfinite.any() and not self._nonfinite_shown:
             self._nonfinite_shown = True
-            text = record.describe_nonfinite(met, driver.config.first_seed, driver.updates())
-            self.say(text, "yellow")
+            warning_text = record.describe_nonfinite(
+                num_nonfinite, driver.config.first_seed, driver.updates()
+            )
+            self.say(warning_text, "yellow")
 
     def evaluated(self, driver: RunDriver, evaluation: Evaluation, rows: Arrays) -> None:
         """Shows how far the run is and how well it does."""
@@ -191,26 +195,34 @@ class SweepScreen(Observer[Driver]):
         self._budgets_before += driver.record.used_up()
         runs = driver.runs
         configurations = self._plan.design.configurations
-        in_chunk = [configurations[number] for number in np.unique(runs.configuration)]
+        chunk_configurations = [configurations[number] for number in np.unique(runs.configuration)]
         settings = []
-        for name in in_chunk[0]:
+        for name in chunk_configurations[0]:
             # Each value once, in the order of the sweep; of many the ends are enough for a line.
-            values = [*dict.fromkeys(say(configuration[name]) for configuration in in_chunk)]
-            if len(values) >= 5:
-                values = [values[0], "...", values[-1]]
-            settings.append(f"{setting_in_words(name)} {', '.join(values)}")
-        count = f"{counted(len(in_chunk), 'configuration')} of {len(configurations):,}"
-        self._display.say(f"{'; '.join(settings)} ({count}, {counted(len(runs.seed), 'run')})")
+            shown_values = [
+                *dict.fromkeys(say(configuration[name]) for configuration in chunk_configurations)
+            ]
+            if len(shown_values) >= 5:
+                shown_values = [shown_values[0], "...", shown_values[-1]]
+            settings.append(f"{setting_in_words(name)} {', '.join(shown_values)}")
+        configuration_count = (
+            f"{counted(len(chunk_configurations), 'configuration')} of {len(configurations):,}"
+        )
+        self._display.say(
+            f"{'; '.join(settings)} ({configuration_count}, {counted(len(runs.seed), 'run')})"
+        )
 
-    def updated(self, driver: Driver, met: np.ndarray) -> None:
+    def updated(self, driver: Driver, num_nonfinite: np.ndarray) -> None:
         """Shows how far it is."""
-        budgets = self._num_ended + driver.record.used_up()
-        fraction = float(budgets / self._num_runs)
+        num_budgets_used = self._num_ended + driver.record.used_up()
+        fraction = float(num_budgets_used / self._num_runs)
         # The time left is estimated from what this process trained: the time that earlier ones
         # took is in no clock of it.
-        gained = float(budgets - self._budgets_before) / self._num_runs
-        running = self._plan.clock.running()
-        progress = driver.record.progress_at(fraction, driver.seconds(), gained, running)
+        gained_fraction = float(num_budgets_used - self._budgets_before) / self._num_runs
+        running_seconds = self._plan.clock.running()
+        progress = driver.record.progress_at(
+            fraction, driver.seconds(), gained_fraction, running_seconds
+        )
         self._display.show_progress(progress)
 
     def ended(self, driver: Driver) -> None:
@@ -220,14 +232,14 @@ class SweepScreen(Observer[Driver]):
 
 def _returns_and_speed(progress: record.Progress) -> str:
     """Returns the returns and, after a block of updates, the mean speed."""
-    text = f"return {progress.iqm:7.1f}  worst {progress.worst:7.1f}"
+    progress_line = f"return {progress.iqm:7.1f}  worst {progress.worst:7.1f}"
     if progress.failed:
         seeds = f"{progress.failed:,} of {progress.num_seeds:,} seeds"
-        text = f"return {progress.iqm:7.1f}  worst nan ({seeds})"
+        progress_line = f"return {progress.iqm:7.1f}  worst nan ({seeds})"
     # NaN before the first block of updates.
     if not math.isnan(progress.env_steps_per_second):
-        text += f"  {progress.env_steps_per_second:,.0f} steps/s"
-    return text
+        progress_line += f"  {progress.env_steps_per_second:,.0f} steps/s"
+    return progress_line
 
 
 def _time_left(progress: record.Progress) -> str:
@@ -240,14 +252,14 @@ def _time_left(progress: record.Progress) -> str:
 def percent_done(fraction: float) -> str:
     """Returns a fraction as a percentage with one decimal, rounded down: 100% is all."""
     # As a decimal number: a float such as 0.29 is a little less, and would be rounded to 28.9%.
-    shown = Decimal(repr(fraction)).quantize(Decimal("0.001"), ROUND_DOWN)
-    return f"{100 * shown:.1f}%"
+    shown_fraction = Decimal(repr(fraction)).quantize(Decimal("0.001"), ROUND_DOWN)
+    return f"{100 * shown_fraction:.1f}%"
 
 
 def summary_table(summary: dict[str, Any]) -> Table:
     """Returns the table that ends a run."""
     num_seeds = f"{summary['num_seeds']:,}"
-    table = Table(title=f"{summary['env']}, {num_seeds} seeds", show_header=False)
+    summary_rows = Table(title=f"{summary['env']}, {num_seeds} seeds", show_header=False)
     low, high = summary["iqm_ci"]
     if math.isfinite(low) and math.isfinite(high):
         interval = f"95% interval {low:.1f} to {high:.1f}"
@@ -255,32 +267,44 @@ def summary_table(summary: dict[str, Any]) -> Table:
         interval = "no interval"
     if not enough(summary["num_seeds"]):
         interval += " below six seeds"
-    table.add_row("return, interquartile mean over seeds", f"{summary['iqm']:.1f}  ({interval})")
+    summary_rows.add_row(
+        "return, interquartile mean over seeds", f"{summary['iqm']:.1f}  ({interval})"
+    )
     returns = np.array(summary["final_returns"])
     # ``min`` is NaN if a seed failed, which then is the worst; ``fmax`` passes over it.
-    table.add_row("worst and best seed", f"{returns.min():.1f}, {np.fmax.reduce(returns):.1f}")
-    if failed := summary["seeds_nonfinite_at_end"]:
-        row = f"{failed:,} of {num_seeds}, worse than every other"
-        table.add_row("seeds whose return is not finite", row)
-    if broken := sum(summary["nonfinite"]):
-        row = f"{broken:,}, of all seeds together"
-        table.add_row("updates with values not finite", row)
-    if (at_end := summary["seeds_solved_at_end"]) is not None:
-        row = f"{at_end:,} of {num_seeds} at the end, {summary['seeds_ever_solved']:,} ever"
-        table.add_row(f"seeds at {summary['threshold']:,g}, the task's threshold", row)
-        solved = [count for count in summary["env_steps_to_solve"] if count is not None]
-        if solved:
-            table.add_row("env steps to solve", f"{min(solved):,} to {max(solved):,}")
+    summary_rows.add_row(
+        "worst and best seed", f"{returns.min():.1f}, {np.fmax.reduce(returns):.1f}"
+    )
+    if num_failed := summary["seeds_nonfinite_at_end"]:
+        row_text = f"{num_failed:,} of {num_seeds}, worse than every other"
+        summary_rows.add_row("seeds whose return is not finite", row_text)
+    if num_nonfinite := sum(summary["nonfinite"]):
+        row_text = f"{num_nonfinite:,}, of all seeds together"
+        summary_rows.add_row("updates with values not finite", row_text)
+    if (num_solved := summary["seeds_solved_at_end"]) is not None:
+        row_text = (
+            f"{num_solved:,} of {num_seeds} at the end, {summary['seeds_ever_solved']:,} ever"
+        )
+        summary_rows.add_row(f"seeds at {summary['threshold']:,g}, the task's threshold", row_text)
+        solving_steps = [
+            steps_to_solve
+            for steps_to_solve in summary["env_steps_to_solve"]
+            if steps_to_solve is not None
+        ]
+        if solving_steps:
+            summary_rows.add_row(
+                "env steps to solve", f"{min(solving_steps):,} to {max(solving_steps):,}"
+            )
     if "final_test_returns" in summary:
-        last = iqm(np.array(summary["final_test_returns"]))
-        best = iqm(np.array(summary["best_test_returns"]))
-        table.add_row("last policies on fresh starts", f"{last:.1f}")
+        last_iqm = iqm(np.array(summary["final_test_returns"]))
+        best_iqm = iqm(np.array(summary["best_test_returns"]))
+        summary_rows.add_row("last policies on fresh starts", f"{last_iqm:.1f}")
         # The best policies were chosen by their evaluations, so those flatter them.
-        luck = " (their evaluation was luck)" if best < last else ""
-        table.add_row("best policies on fresh starts", f"{best:.1f}{luck}")
-    table.add_row("env steps per second", f"{summary['env_steps_per_second']:,.0f}")
-    useful = percent_done(summary["useful_step_fraction"])
-    table.add_row("steps of episodes, of all simulated", useful)
-    table.add_row("compiling", f"{summary['compile_seconds']:.1f} s")
-    table.add_row("training and evaluating", f"{summary['run_seconds']:.1f} s")
-    return table
+        luck_note = " (their evaluation was luck)" if best_iqm < last_iqm else ""
+        summary_rows.add_row("best policies on fresh starts", f"{best_iqm:.1f}{luck_note}")
+    summary_rows.add_row("env steps per second", f"{summary['env_steps_per_second']:,.0f}")
+    useful_percent = percent_done(summary["useful_step_fraction"])
+    summary_rows.add_row("steps of episodes, of all simulated", useful_percent)
+    summary_rows.add_row("compiling", f"{summary['compile_seconds']:.1f} s")
+    summary_rows.add_row("training and evaluating", f"{summary['run_seconds']:.1f} s")
+    return summary_rows
