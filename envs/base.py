@@ -89,10 +89,8 @@ def _is_sound(data: mjx.Data) -> jax.Array:
 
     C looks at positions and velocities when the next step begins, which may be one step later.
     """
-    state_arrays = data.qpos, data.qvel, data.qacc
-    return functools.reduce(
-        jnp.logical_and, (jnp.all(jnp.abs(x) <= mjMAXVAL) for x in state_arrays)
-    )
+    arrays = data.qpos, data.qvel, data.qacc
+    return functools.reduce(jnp.logical_and, (jnp.all(jnp.abs(x) <= mjMAXVAL) for x in arrays))
 
 
 class MujocoEnv(Env):

@@ -89,20 +89,16 @@ def check_centers(
     # The check is made while ``draw`` is traced, but it needs numbers.
     with jax.ensure_compile_time_eval():
         keys = jax.random.split(jax.random.key(0), _DRAWS)
-        drawn_centers = np.asarray(
-            jax.vmap(lambda key: jnp.asarray(randomize(key)["body_ipos"]))(keys)
-        )
-    has_moved = np.any(drawn_centers != np.asarray(center), axis=(0, 2))
+        draws = np.asarray(jax.vmap(lambda key: jnp.asarray(randomize(key)["body_ipos"]))(keys))
+    has_moved = np.any(draws != np.asarray(center), axis=(0, 2))
     # body_simple is 1 where MuJoCo takes the body's block of the inertia matrix to be diagonal. The
     # block of one degree of freedom is a single number, which has its place.
     fixed_bodies = np.flatnonzero(has_moved & (model.body_simple == 1) & (model.body_dofnum > 1))
     if fixed_bodies.size:
-        body_names = ", ".join(
-            model.body(int(body)).name or f"number {body}" for body in fixed_bodies
-        )
+        bodies = ", ".join(model.body(int(body)).name or f"number {body}" for body in fixed_bodies)
         raise UnsupportedError(
             f"body_ipos of {name}.randomize moves the center of mass of a body at whose origin "
-            f'MuJoCo took it to be ({body_names}); write <body simple="false"> in the model'
+            f'MuJoCo took it to be ({bodies}); write <body simple="false"> in the model'
         )
 
 

@@ -29,9 +29,7 @@ NOT_CARRIED = {
 }
 _JOINT_REMEDY = "give it to the joint, times the square of gear"
 _ONE_NUMBER = "give one number"
-_SOLVER_REMEDY = (
-    'set <option iterations="100" ls_iterations="50"/>, or solver="Newton" cone="pyramidal"'
-)
+_SOLVER = 'set <option iterations="100" ls_iterations="50"/>, or solver="Newton" cone="pyramidal"'
 #: What else MJX ignores in silence.
 _IGNORED = (
     ("actuator_armature", "the armature of an actuator", _JOINT_REMEDY),
@@ -77,19 +75,9 @@ _REMEDIES = {
     "own",
     "mjENBL_": "take that <flag> out of <option>",
 }
-_OTHER_REMEDY = (
-    "remove it; MuJoCo's documentation lists what MJX supports under 'MJX, feature parity'"
-)
+_REMOVAL = "remove it; MuJoCo's documentation lists what MJX supports under 'MJX, feature parity'"
 #: Fields of a model that say how stiff its constraints are.
-_SOLREF_FIELDS = (
-    "dof_{}",
-    "eq_{}",
-    "geom_{}",
-    "jnt_{}",
-    "pair_{}",
-    "tendon_{}_lim",
-    "tendon_{}_fri",
-)
+_SOLREF = ("dof_{}", "eq_{}", "geom_{}", "jnt_{}", "pair_{}", "tendon_{}_lim", "tendon_{}_fri")
 #: A message names so many geoms, or pairs of them.
 _MAX_NAMED = 3
 
@@ -161,7 +149,7 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
             names = _listed([getattr(model, kind)(i).name or f"number {i}" for i in narrow_ranges])
             remedy = "give it a margin of at most half of its range"
             yield f"one of two limits that a {kind} meets at once ({names})", remedy
-    refs = (getattr(model, field_format.format("solref")) for field_format in _SOLREF_FIELDS)
+    refs = (getattr(model, field_format.format("solref")) for field_format in _SOLREF)
     if any(np.any((ref[:, 0] > 0) != (ref[:, 1] > 0)) for ref in refs):
         remedy = "give two positive numbers, or two that are not"
         yield "MuJoCo's default in place of a solref of mixed signs", remedy
@@ -172,9 +160,9 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
     if stops_early(model):
         early_stop = f"where C stops after so few iterations ({model.opt.iterations}), with "
         if model.opt.solver == _C.mjtSolver.mjSOL_CG:
-            yield early_stop + "conjugate gradients", _SOLVER_REMEDY
+            yield early_stop + "conjugate gradients", _SOLVER
         if model.opt.cone == _C.mjtCone.mjCONE_ELLIPTIC and any(geom_pairs(model)):
-            yield early_stop + "elliptic cones", _SOLVER_REMEDY
+            yield early_stop + "elliptic cones", _SOLVER
     if model.opt.disableactuator:
         yield "disabled groups of actuators", "remove actuatorgroupdisable, or those actuators"
     for flag, values in (("spring", "stiffness"), ("damper", "damping")):
@@ -196,7 +184,7 @@ def _missing(model: MjModel) -> Iterator[tuple[str, str]]:
     for values, in_mjx, in_c in (*enums, (flags, mjx.EnableBit, _ENABLED)):
         for kind in sorted({*map(int, values)} - {*map(int, in_mjx)}):
             name = in_c(kind).name
-            remedy = next((x for part, x in _REMEDIES.items() if part in name), _OTHER_REMEDY)
+            remedy = next((x for part, x in _REMEDIES.items() if part in name), _REMOVAL)
             # MJX would ignore the discrete integrator, which _ignored says.
             if name != "mjINT_DISCRETE":
                 yield f"MJX has no {name}", remedy

@@ -53,10 +53,10 @@ def build_settings(env: Any, arguments: dict[str, Any]) -> Any:
         checks.check_name(f"argument of {task}", name, init_fields)
     no_default = dataclasses.MISSING
     # Before the dataclass complains, which would name its constructor and not the task.
-    required_names = [
+    required = [
         x.name for x in init_fields.values() if x.default is x.default_factory is no_default
     ]
-    missing = [name for name in required_names if name not in arguments]
+    missing = [name for name in required if name not in arguments]
     if missing:
         raise ValueError(
             f"{task} needs {', '.join(missing)}: pass them, or give them defaults in its Settings"

@@ -49,7 +49,7 @@ _LEAST_TANH_STD = 0.005
 _SERIES_PIVOT = 4.0
 # A bound farther away, in standard deviations, is treated as this far: it cuts off nothing either
 # way, and the square stays finite in float32.
-_MAX_DISTANCE = 1e9
+_MAX_C = 1e9
 
 
 def tanh_normal(
@@ -265,7 +265,7 @@ def segment(order: int, c: jax.Array, width: jax.Array) -> jax.Array:
       width: [...] at least 0.
     """
     c = jnp.maximum(c, 0.0)
-    width = jnp.minimum(width, _MAX_DISTANCE)
+    width = jnp.minimum(width, _MAX_C)
     # Minus the logarithm of the factor by which the density falls over the segment.
     log_drop = width * (0.5 * width + c)
     is_short = log_drop < 1.0
@@ -291,10 +291,8 @@ def _segment_jvp(order, primals, tangents):
     c, width = primals
     c_slope, width_slope = tangents
     # In ``width`` the derivative is the integrand there, in c minus the next integral.
-    edge_integrand = jnp.minimum(width, _MAX_DISTANCE) ** order * jnp.exp(
-        -width * (0.5 * width + c)
-    )
-    slope = edge_integrand * width_slope - segment(order + 1, c, width) * c_slope
+    edge_slope = jnp.minimum(width, _MAX_C) ** order * jnp.exp(-width * (0.5 * width + c))
+    slope = edge_slope * width_slope - segment(order + 1, c, width) * c_slope
     return segment(order, c, width), slope
 
 
@@ -378,14 +376,9 @@ def truncated_kl(
     shift = (mode - other_mode) / other_std
     log_ratio = jnp.log(other_mass / mass) - jnp.log(ratio)
     # What multiplies t and t^2 in the mean: small where the two Normals are nearly equal.
-    linear_factor = ratio * (other_c + shift) - c
-    quadratic_factor = 0.5 * (ratio - 1.0) * (ratio + 1.0)
-    kl = (
-        log_ratio
-        + quadratic_factor * second_moment
-        + linear_factor * offset
-        + shift * (0.5 * shift + other_c)
-    )
+    slope = ratio * (other_c + shift) - c
+    curvature = 0.5 * (ratio - 1.0) * (ratio + 1.0)
+    kl = log_ratio + curvature * second_moment + slope * offset + shift * (0.5 * shift + other_c)
     # Rounding may leave less than 0. It is lifted without a gradient: the derivatives of the
     # divergence of nearly equal Normals count in the natural gradient.
     return kl + jax.lax.stop_gradient(jnp.maximum(-kl, 0.0))

@@ -86,12 +86,8 @@ def check_update(update: updates.Update) -> None:
     try:
         inspect.signature(update).bind("problem", "key", "params", "opt_state")
     except (TypeError, ValueError):
-        update_text = (
-            f"{update.__name__}, which is to be called" if callable(update) else repr(update)
-        )
-        raise ValueError(
-            f"update must be such as mjx_reinforce.full_batch(), got {update_text}"
-        ) from None
+        name = f"{update.__name__}, which is to be called" if callable(update) else repr(update)
+        raise ValueError(f"update must be such as mjx_reinforce.full_batch(), got {name}") from None
 
 
 def check_estimator(

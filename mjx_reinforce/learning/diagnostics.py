@@ -49,12 +49,12 @@ def visited_steps(trajectory: Trajectory) -> Visited:
     episodes = slice(None, None, -(-trajectory.mask.shape[1] // MAX_COMPARED))
     mask = trajectory.mask[:, episodes]
     horizon, num_episodes = mask.shape
-    steps_per_episode = min(horizon, MAX_COMPARED // num_episodes)
+    num_steps = min(horizon, MAX_COMPARED // num_episodes)
 
     # The stride [M] in time depends on how long an episode was, so times are [K, M] and traced.
     length = jnp.sum(mask, axis=0)
-    stride = jnp.maximum(-(-length // steps_per_episode), 1)
-    step_index = stride // 2 + stride * jnp.arange(steps_per_episode)[:, None]
+    stride = jnp.maximum(-(-length // num_steps), 1)
+    step_index = stride // 2 + stride * jnp.arange(num_steps)[:, None]
 
     # The steps taken of an episode share its length, so that a long episode counts for more, as it
     # does in the mean over all steps. A short episode has fewer than K; the rest have weight 0.
@@ -64,9 +64,7 @@ def visited_steps(trajectory: Trajectory) -> Visited:
     def take(x):
         """Returns [K, M, ...] of an array [T, N, ...]; where the weight is 0, of any step."""
         entry_axes = (1,) * (x.ndim - 2)
-        index = jnp.minimum(step_index, horizon - 1).reshape(
-            steps_per_episode, num_episodes, *entry_axes
-        )
+        index = jnp.minimum(step_index, horizon - 1).reshape(num_steps, num_episodes, *entry_axes)
         return jnp.take_along_axis(x[:, episodes], index, axis=0)
 
     return Visited(

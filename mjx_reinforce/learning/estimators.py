@@ -316,7 +316,5 @@ def _discounted_sums(x: jax.Array, discount: jax.Array) -> jax.Array:
     # A matrix [T, T] of discount^(s - t) where s >= t, else 0. The exponent is clipped besides:
     # a negative power of 0 is infinite.
     steps_ahead = step_index - step_index[:, None]
-    discount_factors = jnp.where(
-        steps_ahead < 0, 0, jnp.power(discount, jnp.maximum(steps_ahead, 0))
-    )
-    return jnp.matmul(discount_factors, x, precision="highest")
+    powers = jnp.where(steps_ahead < 0, 0, jnp.power(discount, jnp.maximum(steps_ahead, 0)))
+    return jnp.matmul(powers, x, precision="highest")

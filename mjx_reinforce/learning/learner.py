@@ -222,7 +222,7 @@ def reinforce(
     actor_shapes = jax.eval_shape(functools.partial(first_actor, policy, size), jax.random.key(0))
     # Three times: the parameters, their gradient, and what they become.
     check_room(3.0 * sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(actor_shapes)))
-    acting_policy = choice.ActingPolicy(
+    actor_policy = choice.ActingPolicy(
         functools.partial(act, policy), actor_shapes, policy.distribution
     )
     parts = _Reinforce(
@@ -237,7 +237,7 @@ def reinforce(
         max_kl=max_kl,
         normalize_steps=normalize_steps,
         normalize_min_std=normalize_min_std,
-        engine=choice.choose(engine, env, acting_policy, horizon),
+        engine=choice.choose(engine, env, actor_policy, horizon),
     )
     return Learner(parts.init, RolloutPlay(parts.play), parts.learn, policy, parts.engine)
 
@@ -381,20 +381,16 @@ class _Reinforce:
         next_state, num_skipped = keep_finite(next_state, state, is_sound)
 
         # Measured of the actor that was kept, at the same steps at which the change was limited.
-        policy_change = diagnostics.policy_metrics(
-            self.policy, old_actor, next_state.actor, visited
-        )
-        measurements = estimator_metrics | step_metrics | policy_change
+        policy_kl = diagnostics.policy_metrics(self.policy, old_actor, next_state.actor, visited)
+        measurements = estimator_metrics | step_metrics | policy_kl
         return next_state, update_metrics(trajectory, num_skipped, measurements)
 
-    def _problem(
-        self, state: TrainState, scaled_trajectory: Trajectory, weight: jax.Array
-    ) -> Problem:
+    def _problem(self, state: TrainState, trajectory: Trajectory, weight: jax.Array) -> Problem:
         """Returns minus the sum in the formula, and all else that an ``Update`` reads.
 
         Args:
           state: before the update.
-          scaled_trajectory: [T, N] what was played, with scaled observations.
+          trajectory: [T, N] what was played, with scaled observations.
           weight: [T, N] w, from the estimator.
         """
         distribution = self.policy.distribution
@@ -413,12 +409,7 @@ class _Reinforce:
         return Problem(
             surrogate=surrogate,
             optimizer=self.optimizer,
-            samples=(
-                scaled_trajectory.observation,
-                scaled_trajectory.action,
-                weight,
-                scaled_trajectory.mask,
-            ),
+            samples=(trajectory.observation, trajectory.action, weight, trajectory.mask),
             # By N, not by the steps that were played, which depend on the policy.
             divisor=self.num_episodes,
             clock=Clock(state.progress, counts.as_float(state.env_steps)),
@@ -486,13 +477,11 @@ def keep_finite(
     is_finite = jnp.all(jnp.isfinite(new_floats)) & is_sound
     chosen_floats = iter(unravel(jnp.where(is_finite, new_floats, old_floats)))
 
-    def choose(new_leaf: jax.Array, old_leaf: jax.Array) -> jax.Array:
+    def choose(new: jax.Array, old: jax.Array) -> jax.Array:
         # ``jax.tree.map`` visits leaves in the order of ``jax.tree.leaves`` above.
-        if is_float(new_leaf):
+        if is_float(new):
             return next(chosen_floats)
-        return (
-            new_leaf if new_leaf is old_leaf else jnp.where(is_finite, new_leaf, old_leaf)
-        )  # no update touches the key
+        return new if new is old else jnp.where(is_finite, new, old)  # no update touches the key
 
     return jax.tree.map(choose, candidate, old_state), jnp.where(is_finite, 0, 1)
 

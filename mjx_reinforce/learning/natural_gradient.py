@@ -97,10 +97,8 @@ def natural_gradient(
         # g'x is positive, as the matrix is positive definite; without a gradient it is 0, and the
         # policy stays.
         slope = jnp.vdot(unit_gradient, direction, precision="highest")
-        step_length = jnp.where(
-            slope > 0, jnp.sqrt(2 * max_kl / jnp.where(slope > 0, slope, 1.0)), 0.0
-        )
-        return unravel((step_length * direction).astype(flat_gradient.dtype))
+        length = jnp.where(slope > 0, jnp.sqrt(2 * max_kl / jnp.where(slope > 0, slope, 1.0)), 0.0)
+        return unravel((length * direction).astype(flat_gradient.dtype))
 
     return whole_rollout(turn)
 

@@ -115,19 +115,13 @@ def between(old_normalizer: Normalizer, new_normalizer: Normalizer, share: jax.A
 
     Before the first observation the scale is 1, and it moves from there.
     """
-    interpolation = jax.tree.map(
-        lambda old, new: old + share * (new - old), old_normalizer, new_normalizer
-    )
+    blend = jax.tree.map(lambda old, new: old + share * (new - old), old_normalizer, new_normalizer)
     # The variance goes from 1 to the first one; m2 is the count times that.
     variance = new_normalizer.m2 / jnp.maximum(new_normalizer.count, 1.0)
-    first_m2 = interpolation.count * (1.0 + share * (variance - 1.0))
-    interpolation = interpolation.replace(
-        m2=jnp.where(old_normalizer.count > 0, interpolation.m2, first_m2)
-    )
+    first_m2 = blend.count * (1.0 + share * (variance - 1.0))
+    blend = blend.replace(m2=jnp.where(old_normalizer.count > 0, blend.m2, first_m2))
     # old + 1 * (new - old) is not new in floating point.
-    return jax.tree.map(
-        lambda old, new: jnp.where(share < 1.0, old, new), interpolation, new_normalizer
-    )
+    return jax.tree.map(lambda old, new: jnp.where(share < 1.0, old, new), blend, new_normalizer)
 
 
 def apply(normalizer: Normalizer, observation: jax.Array) -> jax.Array:

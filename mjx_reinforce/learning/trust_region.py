@@ -136,23 +136,17 @@ def _share_within(
     def body(search: _Search) -> _Search:
         """Tries a share between the greatest that fits and the least that does not."""
         is_below = search.kl <= _MAX_FILL * max_kl
-        low_share = jnp.where(is_below, search.share, search.low)
-        high_share = jnp.where(is_below, search.high, search.share)
+        low = jnp.where(is_below, search.share, search.low)
+        high = jnp.where(is_below, search.high, search.share)
         # If KL were a square of the share, this share would hit the target. Where it is no square,
         # every second share halves what is left between low and high, in the logarithm.
-        quadratic_share = search.share * jnp.sqrt(_TARGET_FILL * max_kl / search.kl)
-        is_usable = (
-            (quadratic_share > low_share)
-            & (quadratic_share < high_share)
-            & (search.trials % 2 == 1)
-        )
-        share = jnp.where(is_usable, quadratic_share, jnp.sqrt(low_share) * jnp.sqrt(high_share))
-        next_search = _Search(share, kl_at(share), low_share, high_share, search.trials + 1)
+        root_share = search.share * jnp.sqrt(_TARGET_FILL * max_kl / search.kl)
+        is_usable = (root_share > low) & (root_share < high) & (search.trials % 2 == 1)
+        share = jnp.where(is_usable, root_share, jnp.sqrt(low) * jnp.sqrt(high))
+        next_search = _Search(share, kl_at(share), low, high, search.trials + 1)
         # Vmapped over seeds, the loop goes on until the last one is done; the others stay.
-        is_unfinished = unfinished(search)
-        return jax.tree.map(
-            lambda new, old: jnp.where(is_unfinished, new, old), next_search, search
-        )
+        is_open = unfinished(search)
+        return jax.tree.map(lambda new, old: jnp.where(is_open, new, old), next_search, search)
 
     min_share = jnp.full_like(first_share, _MIN_SHARE)
     max_share = jnp.ones_like(first_share)

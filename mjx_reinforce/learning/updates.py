@@ -146,11 +146,11 @@ def descend(
     norm = optax.tree.norm(grads)
     # Schedules read the clock; other optimizers of optax would not take it.
     optimizer = optax.with_extra_args_support(problem.optimizer)
-    params_change, opt_state = optimizer.update(
+    change, opt_state = optimizer.update(
         gradient_map(grads), opt_state, params, clock=problem.clock
     )
     metrics = {"gradient_norm": norm}
-    return optax.apply_updates(params, params_change), opt_state, metrics
+    return optax.apply_updates(params, change), opt_state, metrics
 
 
 def make_optimizer(

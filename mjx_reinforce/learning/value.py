@@ -82,12 +82,8 @@ def value_baseline(
       >>> mr.value_baseline(discount=1.0)
       Estimator(of 1 episodes or more)
     """
-    for name, whole_number in (
-        ("horizon", horizon),
-        ("num_fits", num_fits),
-        ("batch_size", batch_size),
-    ):
-        check_count(name, whole_number)
+    for name, count in (("horizon", horizon), ("num_fits", num_fits), ("batch_size", batch_size)):
+        check_count(name, count)
     returns_to_go, network, fitter = _defaults(discount, network, optimizer)
 
     def value(params, observation, step_index):
@@ -197,10 +193,8 @@ def full_batch_value_baseline(
         def fit(critic, _):
             _, grads, _ = accumulate_gradient(squared_error, critic.params, step_arrays)
             grads = jax.tree.map(lambda g: g / steps, grads)
-            params_change, opt_state = fitter.update(grads, critic.opt_state, critic.params)
-            return FullBatchCritic(
-                optax.apply_updates(critic.params, params_change), opt_state
-            ), None
+            change, opt_state = fitter.update(grads, critic.opt_state, critic.params)
+            return FullBatchCritic(optax.apply_updates(critic.params, change), opt_state), None
 
         critic, _ = lax.scan(fit, critic, length=num_fits)
         return weight, critic, metrics

@@ -161,11 +161,9 @@ def each_step() -> Update:
         def body(carry):
             t, params, opt_state, sums = carry
             params, opt_state, metrics = optimizer_step(t, params, opt_state)
-            next_carry = t + 1, params, opt_state, jax.tree.map(jnp.add, sums, metrics)
+            step = t + 1, params, opt_state, jax.tree.map(jnp.add, sums, metrics)
             # Vmapped over seeds, the loop goes on until the seed with the longest episode is done.
-            return jax.tree.map(
-                lambda new, old: jnp.where(has_next(carry), new, old), next_carry, carry
-            )
+            return jax.tree.map(lambda new, old: jnp.where(has_next(carry), new, old), step, carry)
 
         start = jnp.zeros((), jnp.int32)
         shapes = jax.eval_shape(optimizer_step, start, params, opt_state)[2]

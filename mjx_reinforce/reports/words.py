@@ -262,8 +262,8 @@ def caveats(findings: Findings) -> Iterator[str]:
         yield (
             "Where returns fall in two groups far apart, an interval of so few seeds does not keep "
             f"its 95%: if three seeds in ten are of the other group, {min_seeds} seeds show none "
-            f"of them {percent(miss_probability)} of the time, so the interval of the mean holds the "
-            f"truth at most {percent(1 - miss_probability)} of the time."
+            f"of them {percent(miss_probability)} of the time, so the interval of the mean holds "
+            f"the truth at most {percent(1 - miss_probability)} of the time."
         )
     num_failures = sum(int(np.sum(~np.isfinite(result.final))) for result in results)
     if num_failures:
@@ -313,10 +313,8 @@ def _rises(band: Estimate) -> bool:
     points = np.flatnonzero(np.isfinite(band.value))
     if len(points) < 5:
         return False
-    late_point = points[int(0.85 * (len(points) - 1))]
-    last_point = points[-1]
-    rise = band.value[last_point] - band.value[late_point]
+    start = points[int(0.85 * (len(points) - 1))]
+    end = points[-1]
+    rise = band.value[end] - band.value[start]
     # Intervals that lie apart may be ever so narrow: a rise of less than a percent is none.
-    return bool(
-        band.low[last_point] > band.high[late_point] and rise > 0.01 * np.ptp(band.value[points])
-    )
+    return bool(band.low[end] > band.high[start] and rise > 0.01 * np.ptp(band.value[points]))

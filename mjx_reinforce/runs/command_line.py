@@ -72,27 +72,23 @@ def parse(arguments: Sequence[str], name: str = "train") -> Design:
             "run ends; leave one out"
         )
     if base.resume is None:
-        swept_values = read_over(sweep.over)
+        swept = read_over(sweep.over)
         if name == "sweep":
-            check_swept(swept_values)
+            check_swept(swept)
         return Design(
-            base=base,
-            default=default,
-            over=swept_values,
-            exact=sweep.exact,
-            chunk_runs=sweep.chunk_runs,
+            base=base, default=default, over=swept, exact=sweep.exact, chunk_runs=sweep.chunk_runs
         )
     directory = base.resume
     design = read_design(directory)
     # The flags are read again, now with the saved settings as defaults: a setting that no flag
     # names must stay as it is, and the comparison below sees only what the user changes.
     base, sweep = _read(name, flags, design.base, prog)
-    swept_values = read_over(sweep.over)
+    swept = read_over(sweep.over)
     # A sweep may be named by its --over again, which is how its user confirms code of their own.
-    is_unchanged = swept_values in ({}, design.over) and sweep == SweepSettings(over=sweep.over)
+    is_unchanged = swept in ({}, design.over) and sweep == SweepSettings(over=sweep.over)
     if not is_unchanged or (design.is_sweep and base != design.base):
         raise ValueError(f"what is in {directory} goes on as it is: give --resume alone")
-    if not swept_values and any(is_own(x) for name in CODE for x in design.over.get(name, ())):
+    if not swept and any(is_own(x) for name in CODE for x in design.over.get(name, ())):
         raise ValueError(
             f"{directory} compares code of your own, and this would run that code; if you trust "
             "it, repeat the sweep's --over"
@@ -163,7 +159,7 @@ def _read(
       ValueError: see ``flags.read_command_line``; or the flags say by --seeds and by --num-seeds
         how many seeds there are.
     """
-    command_description, groups = _COMMANDS[name]
+    about, groups = _COMMANDS[name]
     default_values = vars(default)
     # A dataclass of dataclasses, one a group, whose titles become the headings of --help. The
     # fields of ``SweepSettings`` are not in a ``Config`` and keep their own defaults.
@@ -173,29 +169,24 @@ def _read(
         group_fields.append((title, group, group(**{name: default_values[name] for name in names})))
     arguments_class = dataclasses.make_dataclass("Arguments", group_fields, frozen=True)
     setting_groups = vars(
-        read_command_line(arguments_class, arguments, prog, f"{command_description}\n\n{_names()}")
+        read_command_line(arguments_class, arguments, prog, f"{about}\n\n{_names()}")
     )
-    setting_values = {
-        name: x for group in setting_groups.values() for name, x in vars(group).items()
-    }
+    values = {name: x for group in setting_groups.values() for name, x in vars(group).items()}
     # What is left over after this are the settings of the sweep, if it is one.
-    config = Config(**{name: setting_values.pop(name) for name in default_values})
+    config = Config(**{name: values.pop(name) for name in default_values})
     if config.seeds is not None:
         if flag_value(arguments, "--num-seeds"):
             raise ValueError(
                 f"--seeds {config.seeds} says how many seeds there are: leave --num-seeds out"
             )
         config = dataclasses.replace(config, num_seeds=len(read_seeds(config.seeds)))
-    return config, SweepSettings(**setting_values)
+    return config, SweepSettings(**values)
 
 
 def _names() -> str:
     """Returns the presets and the tasks, for --help."""
-    name_width = max(map(len, PRESETS))
-    presets = "\n".join(
-        f"  {name:{name_width}}  {preset_description}"
-        for name, (preset_description, _) in PRESETS.items()
-    )
+    width = max(map(len, PRESETS))
+    presets = "\n".join(f"  {name:{width}}  {summary}" for name, (summary, _) in PRESETS.items())
     return (
         f"Presets, published programs whose settings replace the defaults:\n{presets}\n\n"
         f"Environments: {', '.join(envs.names())}."

@@ -91,11 +91,7 @@ def _unfinished(group_plans: Sequence[GroupPlan], own_files: Sequence[Files]) ->
     """Returns the groups of which some chunks have not ended yet, with these chunks alone."""
     unfinished_groups = []
     for group_plan in group_plans:
-        chunks = [
-            x
-            for x in group_plan.chunks
-            if not any(run_files.has(x.name) for run_files in own_files)
-        ]
+        chunks = [x for x in group_plan.chunks if not any(files.has(x.name) for files in own_files)]
         if chunks:
             unfinished_groups.append(group_plan._replace(chunks=chunks))
     return unfinished_groups
@@ -125,9 +121,7 @@ def _begin(
     group = group_plan.group
     # The number of seeds is here that of the chunk's runs, whatever configuration each is of.
     config = dataclasses.replace(group.config, num_seeds=len(runs.seed))
-    settings = {
-        name: setting_values[runs.member] for name, setting_values in group.settings.items()
-    }
+    settings = {name: values[runs.member] for name, values in group.settings.items()}
     slots = Slots(compiled_programs, runs.seed, settings)
     if plan.design.is_sweep:
         return Driver(config, slots, Record(config), runs, observers=observers)

@@ -191,17 +191,15 @@ def read_over(flags: Sequence[Sequence[str]]) -> dict[str, list[Any]]:
       ValueError: a setting does not exist or stands twice, or a value is not of its type.
     """
     swept_values: dict[str, list[Any]] = {}
-    for flag_words in flags:
-        if not flag_words:
+    for words in flags:
+        if not words:
             raise ValueError(f"--over needs a setting and its values, {_OVER_WORDS}")
-        name = flag_words[0].removeprefix("--").replace("-", "_")
+        name = words[0].removeprefix("--").replace("-", "_")
         if name not in _SETTINGS and not _of_env(name):
-            raise ValueError(_unknown(flag_words[0].removeprefix("--")))
+            raise ValueError(_unknown(words[0].removeprefix("--")))
         if name in swept_values:
-            raise ValueError(
-                f"--over {flag_words[0]} is given twice: put all values behind one of them"
-            )
-        swept_values[name] = [_value(name, value_word) for value_word in flag_words[1:]]
+            raise ValueError(f"--over {words[0]} is given twice: put all values behind one of them")
+        swept_values[name] = [_value(name, value_word) for value_word in words[1:]]
     return swept_values
 
 
@@ -238,7 +236,7 @@ def check_over(base: Config, over: Mapping[str, Sequence[Any]]) -> None:
             raise ValueError(
                 f"{flag(field.name)} logs a run; leave it out: a sweep writes curves.npz"
             )
-    for name, setting_values in over.items():
+    for name, values in over.items():
         env_setting = _of_env(name)
         if env_setting:
             reason = _SHARED_ENV_SETTINGS.get(env_setting)
@@ -247,41 +245,35 @@ def check_over(base: Config, over: Mapping[str, Sequence[Any]]) -> None:
             reason = _SETTINGS[name].metadata.get("once")
         if reason:
             raise ValueError(f"a sweep cannot go over {spoken(name)}: {reason}")
-        if len(setting_values) < 2:
-            if not setting_values:
+        if len(values) < 2:
+            if not values:
                 remedy = f", {_OVER_WORDS}"
             elif env_setting:
-                remedy = f"; for one value pass --env-set {env_setting}={setting_values[0]}"
+                remedy = f"; for one value pass --env-set {env_setting}={values[0]}"
             else:
                 remedy = f"; for one value pass {flag(name)}"
             raise ValueError(f"--over {spoken(name)} needs two values or more{remedy}")
         # Two equal configurations would have the same seeds, and so count each result twice.
-        repeated_values = [
-            x for value_index, x in enumerate(setting_values) if x in setting_values[:value_index]
-        ]
-        if repeated_values:
-            raise ValueError(f"--over {spoken(name)} has the value {repeated_values[0]} twice")
+        repeats = [x for index, x in enumerate(values) if x in values[:index]]
+        if repeats:
+            raise ValueError(f"--over {spoken(name)} has the value {repeats[0]} twice")
 
 
 def _with_values(base: Config, configuration: Mapping[str, Any]) -> Config:
     """Returns settings with other values, also of settings of the environment."""
     config_values = {}
-    env_assignments = {}
+    env_words = {}
     for name, value in configuration.items():
         if env_setting := _of_env(name):
-            env_assignments[env_setting] = f"{env_setting}={value}"
+            env_words[env_setting] = f"{env_setting}={value}"
         else:
             config_values[name] = value
     config = dataclasses.replace(base, **config_values)
-    if not env_assignments:
+    if not env_words:
         return config
     # The base may set what is swept, too, and an environment refuses a setting that stands twice.
-    base_assignments = [
-        assignment
-        for assignment in config.env_set
-        if assignment.partition("=")[0] not in env_assignments
-    ]
-    return dataclasses.replace(config, env_set=(*base_assignments, *env_assignments.values()))
+    base_words = [word for word in config.env_set if word.partition("=")[0] not in env_words]
+    return dataclasses.replace(config, env_set=(*base_words, *env_words.values()))
 
 
 def _value(name: str, value_word: str) -> Any:

@@ -117,17 +117,15 @@ class Display(Observer[RunDriver]):
         """
         self.say(summary_table(summary))
         # In commands that are to be copied the path is quoted for the shell, elsewhere as it is.
-        quoted_directory = shlex.quote(str(directory))
+        quoted = shlex.quote(str(directory))
         if summary["status"] == "interrupted":
-            self.say(
-                f"Interrupted: go on with --resume {quoted_directory}{resume_flags}", is_whole=True
-            )
+            self.say(f"Interrupted: go on with --resume {quoted}{resume_flags}", is_whole=True)
             return
         self.say(f"Files in {directory}; the picture is learning_curve.png.")
         self.show_commands(
             {
-                "To see the best seed play": f"{command('watch')} {quoted_directory}{play_flags}",
-                "For a page of all figures": f"{command('report')} {quoted_directory}",
+                "To see the best seed play": f"{command('watch')} {quoted}{play_flags}",
+                "For a page of all figures": f"{command('report')} {quoted}",
             }
         )
         if summary["status"] == "stopped":
@@ -159,14 +157,12 @@ class Display(Observer[RunDriver]):
                 f"{returns_and_speed}  {percent}  {time_left}".rstrip()
             )
 
-    def updated(self, driver: RunDriver, num_nonfinite: np.ndarray) -> None:
+    def updated(self, driver: RunDriver, failures: np.ndarray) -> None:
         """Says once which seeds met numbers that are not finite; the last table counts them."""
-        if num_nonfinite.any() and not self._nonfinite_shown:
+        if failures.any() and not self._nonfinite_shown:
             self._nonfinite_shown = True
-            warning_text = record.describe_nonfinite(
-                num_nonfinite, driver.config.first_seed, driver.updates()
-            )
-            self.say(warning_text, "yellow")
+            text = record.describe_nonfinite(failures, driver.config.first_seed, driver.updates())
+            self.say(text, "yellow")
 
     def evaluated(self, driver: RunDriver, evaluation: Evaluation, rows: Arrays) -> None:
         """Shows how far the run is and how well it does."""
@@ -195,22 +191,16 @@ class SweepScreen(Observer[Driver]):
         self._budgets_before += driver.record.used_up()
         runs = driver.runs
         configurations = self._plan.design.configurations
-        chunk_configurations = [configurations[number] for number in np.unique(runs.configuration)]
+        members = [configurations[number] for number in np.unique(runs.configuration)]
         settings = []
-        for name in chunk_configurations[0]:
+        for name in members[0]:
             # Each value once, in the order of the sweep; of many the ends are enough for a line.
-            shown_values = [
-                *dict.fromkeys(say(configuration[name]) for configuration in chunk_configurations)
-            ]
-            if len(shown_values) >= 5:
-                shown_values = [shown_values[0], "...", shown_values[-1]]
-            settings.append(f"{setting_in_words(name)} {', '.join(shown_values)}")
-        configuration_count = (
-            f"{counted(len(chunk_configurations), 'configuration')} of {len(configurations):,}"
-        )
-        self._display.say(
-            f"{'; '.join(settings)} ({configuration_count}, {counted(len(runs.seed), 'run')})"
-        )
+            values = [*dict.fromkeys(say(configuration[name]) for configuration in members)]
+            if len(values) >= 5:
+                values = [values[0], "...", values[-1]]
+            settings.append(f"{setting_in_words(name)} {', '.join(values)}")
+        share = f"{counted(len(members), 'configuration')} of {len(configurations):,}"
+        self._display.say(f"{'; '.join(settings)} ({share}, {counted(len(runs.seed), 'run')})")
 
     def updated(self, driver: Driver, num_nonfinite: np.ndarray) -> None:
         """Shows how far it is."""
@@ -218,11 +208,9 @@ class SweepScreen(Observer[Driver]):
         fraction = float(num_budgets_used / self._num_runs)
         # The time left is estimated from what this process trained: the time that earlier ones
         # took is in no clock of it.
-        gained_fraction = float(num_budgets_used - self._budgets_before) / self._num_runs
-        running_seconds = self._plan.clock.running()
-        progress = driver.record.progress_at(
-            fraction, driver.seconds(), gained_fraction, running_seconds
-        )
+        gain = float(num_budgets_used - self._budgets_before) / self._num_runs
+        seconds = self._plan.clock.running()
+        progress = driver.record.progress_at(fraction, driver.seconds(), gain, seconds)
         self._display.show_progress(progress)
 
     def ended(self, driver: Driver) -> None:
@@ -259,7 +247,7 @@ def percent_done(fraction: float) -> str:
 def summary_table(summary: dict[str, Any]) -> Table:
     """Returns the table that ends a run."""
     num_seeds = f"{summary['num_seeds']:,}"
-    summary_rows = Table(title=f"{summary['env']}, {num_seeds} seeds", show_header=False)
+    table = Table(title=f"{summary['env']}, {num_seeds} seeds", show_header=False)
     low, high = summary["iqm_ci"]
     if math.isfinite(low) and math.isfinite(high):
         interval = f"95% interval {low:.1f} to {high:.1f}"
@@ -267,44 +255,32 @@ def summary_table(summary: dict[str, Any]) -> Table:
         interval = "no interval"
     if not enough(summary["num_seeds"]):
         interval += " below six seeds"
-    summary_rows.add_row(
-        "return, interquartile mean over seeds", f"{summary['iqm']:.1f}  ({interval})"
-    )
+    table.add_row("return, interquartile mean over seeds", f"{summary['iqm']:.1f}  ({interval})")
     returns = np.array(summary["final_returns"])
     # ``min`` is NaN if a seed failed, which then is the worst; ``fmax`` passes over it.
-    summary_rows.add_row(
-        "worst and best seed", f"{returns.min():.1f}, {np.fmax.reduce(returns):.1f}"
-    )
+    table.add_row("worst and best seed", f"{returns.min():.1f}, {np.fmax.reduce(returns):.1f}")
     if num_failed := summary["seeds_nonfinite_at_end"]:
-        row_text = f"{num_failed:,} of {num_seeds}, worse than every other"
-        summary_rows.add_row("seeds whose return is not finite", row_text)
+        row = f"{num_failed:,} of {num_seeds}, worse than every other"
+        table.add_row("seeds whose return is not finite", row)
     if num_nonfinite := sum(summary["nonfinite"]):
-        row_text = f"{num_nonfinite:,}, of all seeds together"
-        summary_rows.add_row("updates with values not finite", row_text)
+        row = f"{num_nonfinite:,}, of all seeds together"
+        table.add_row("updates with values not finite", row)
     if (num_solved := summary["seeds_solved_at_end"]) is not None:
-        row_text = (
-            f"{num_solved:,} of {num_seeds} at the end, {summary['seeds_ever_solved']:,} ever"
-        )
-        summary_rows.add_row(f"seeds at {summary['threshold']:,g}, the task's threshold", row_text)
-        solving_steps = [
-            steps_to_solve
-            for steps_to_solve in summary["env_steps_to_solve"]
-            if steps_to_solve is not None
-        ]
-        if solving_steps:
-            summary_rows.add_row(
-                "env steps to solve", f"{min(solving_steps):,} to {max(solving_steps):,}"
-            )
+        row = f"{num_solved:,} of {num_seeds} at the end, {summary['seeds_ever_solved']:,} ever"
+        table.add_row(f"seeds at {summary['threshold']:,g}, the task's threshold", row)
+        solved = [steps for steps in summary["env_steps_to_solve"] if steps is not None]
+        if solved:
+            table.add_row("env steps to solve", f"{min(solved):,} to {max(solved):,}")
     if "final_test_returns" in summary:
         last_iqm = iqm(np.array(summary["final_test_returns"]))
         best_iqm = iqm(np.array(summary["best_test_returns"]))
-        summary_rows.add_row("last policies on fresh starts", f"{last_iqm:.1f}")
+        table.add_row("last policies on fresh starts", f"{last_iqm:.1f}")
         # The best policies were chosen by their evaluations, so those flatter them.
         luck_note = " (their evaluation was luck)" if best_iqm < last_iqm else ""
-        summary_rows.add_row("best policies on fresh starts", f"{best_iqm:.1f}{luck_note}")
-    summary_rows.add_row("env steps per second", f"{summary['env_steps_per_second']:,.0f}")
+        table.add_row("best policies on fresh starts", f"{best_iqm:.1f}{luck_note}")
+    table.add_row("env steps per second", f"{summary['env_steps_per_second']:,.0f}")
     useful_percent = percent_done(summary["useful_step_fraction"])
-    summary_rows.add_row("steps of episodes, of all simulated", useful_percent)
-    summary_rows.add_row("compiling", f"{summary['compile_seconds']:.1f} s")
-    summary_rows.add_row("training and evaluating", f"{summary['run_seconds']:.1f} s")
-    return summary_rows
+    table.add_row("steps of episodes, of all simulated", useful_percent)
+    table.add_row("compiling", f"{summary['compile_seconds']:.1f} s")
+    table.add_row("training and evaluating", f"{summary['run_seconds']:.1f} s")
+    return table

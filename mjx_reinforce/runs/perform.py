@@ -281,24 +281,21 @@ def report_on(outcome: Outcome, *, report: bool = True) -> None:
     if outcome.driver is None and (directory / "report.html").exists():
         display.say(f"the sweep in {directory} is finished")
         return
-    timing_text = (
+    timing = (
         f"compiling took {summary['compile_seconds']:.1f} s, training and evaluating "
         f"{summary['run_seconds']:.1f} s"
     )
     if not report:
-        display.say(f"{timing_text}. Files in {directory}")
+        display.say(f"{timing}. Files in {directory}")
         return
     display.say("writing the report")
     # The lock of training is gone by now, and --resume in another process would write here, too.
     with locked(directory):
-        written_report = _report(directory)
-    timing_text += f", statistics and report {written_report.seconds:.1f} s"
-    for sentence in (
-        *written_report.answer,
-        f"{timing_text}. Files in {directory}, first report.html",
-    ):
+        page = _report(directory)
+    timing += f", statistics and report {page.seconds:.1f} s"
+    for sentence in (*page.answer, f"{timing}. Files in {directory}, first report.html"):
         display.say(sentence)
-    display.show_commands(_watch_command(directory, written_report.best, summary["settings"]))
+    display.show_commands(_watch_command(directory, page.best, summary["settings"]))
 
 
 def _report(directory: Path) -> "WrittenReport":

@@ -248,17 +248,15 @@ def sweep(
     over = {name.replace("-", "_"): setting_values for name, setting_values in over.items()}
     directory = base.output
     with contextlib.ExitStack() as stack:
-        output_directory = directory
+        folder = directory
         # The chunks of a sweep meet in its files alone, so one that leaves none has a folder, too.
-        if output_directory is None:
-            output_directory = Path(
-                stack.enter_context(tempfile.TemporaryDirectory(prefix="sweep-"))
-            )
-        base = dataclasses.replace(base, output=output_directory)
+        if folder is None:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sweep-")))
+        base = dataclasses.replace(base, output=folder)
         design = Design(base=base, over=over, exact=exact, chunk_runs=chunk_runs)
         outcome = perform(design, Interrupt(), quiet=quiet)
         report_on(outcome, report=report and directory is not None)
-        return read_results(output_directory)._replace(directory=directory)
+        return read_results(folder)._replace(directory=directory)
 
 
 def _beginning(name: str, config: Config, output: Path | str | None) -> Config:
@@ -292,10 +290,10 @@ def read_results(directory: Path) -> SweepResults:
         )
     with naming_damage(directory / "sweep.json"):
         # Each with its number, which here is its place in the list.
-        numbered_configurations = record["configurations"]
+        records = record["configurations"]
         configurations = [
             {name: x for name, x in configuration.items() if name != "configuration"}
-            for configuration in numbered_configurations
+            for configuration in records
         ]
     arrays = read_arrays(directory / "curves.npz", SweepResults._fields[2:])
     return SweepResults(directory, configurations, **arrays)

@@ -199,10 +199,8 @@ class RunFiles(Files[RunDriver]):
         else:
             self._take_back(driver, checkpoint)
             num_updates = driver.updates() if checkpoint is not None else 0
-            restart_reason = (
-                "" if num_updates else ": there is no checkpoint yet, so it begins again"
-            )
-            self._say(f"going on after {num_updates} updates{restart_reason}")
+            reason = "" if num_updates else ": there is no checkpoint yet, so it begins again"
+            self._say(f"going on after {num_updates} updates{reason}")
         last_update = None
         if checkpoint is not None:
             # The evaluation of the present policies is made again, unless the record has it.
@@ -371,22 +369,17 @@ class SweepFiles(Files[Driver]):
         """Joins the parts so far, sorted; those of a sweep that ended go after sweep.json."""
         self._check_place()
         paths = sorted(self._parts.glob("*.npz"))
-        arrays_of_parts = {path.stem: read_arrays(path, stored=True) for path in paths}
-        if arrays_of_parts:
+        parts = {path.stem: read_arrays(path, stored=True) for path in paths}
+        if parts:
             curves = join_parts(
-                [
-                    {name: part_arrays[name] for name in _CURVE_TYPES}
-                    for part_arrays in arrays_of_parts.values()
-                ]
+                [{name: part[name] for name in _CURVE_TYPES} for part in parts.values()]
             )
             write_arrays(self._directory / "curves.npz", curves)
         if summary["status"] == "finished":
             # What a kill at this point left is written again, as a whole.
             shutil.rmtree(self._directory / "policies", ignore_errors=True)
             for group_plan in self._plan.group_plans:
-                self._write_policies(
-                    group_plan, [arrays_of_parts[runs.name] for runs in group_plan.chunks]
-                )
+                self._write_policies(group_plan, [parts[runs.name] for runs in group_plan.chunks])
         # Before the parts go: they can make all the files again until this says that it is over.
         self._write_json("sweep.json", summary)
         if summary["status"] == "finished":
@@ -405,18 +398,13 @@ class SweepFiles(Files[Driver]):
         run_arrays = since_their_end(driver.record.history()) | runs._asdict()
         run_arrays["nonfinite"] = driver.record.nonfinite
         curves = {name: run_arrays[name].astype(dtype) for name, dtype in _CURVE_TYPES.items()}
-        last_arrays = {name: curves[name] for name in ("configuration", "seed")}
-        last_arrays["eval_return"] = curves["eval_return"][-1]
+        finals = {name: curves[name] for name in ("configuration", "seed")}
+        finals["eval_return"] = curves["eval_return"][-1]
         # The worst and the best seed of a configuration in the whole sweep are its ends in their
         # chunks, too, so the policies of other seeds need not be stored.
-        rows = np.concatenate(
-            [
-                _ends(last_arrays, configuration_number)
-                for configuration_number in np.unique(runs.configuration)
-            ]
-        )
-        last_arrays |= arrays_of(driver.slots.states().train_states.actor)
-        end_arrays = {f"ends/{name}": np.asarray(x)[rows] for name, x in last_arrays.items()}
+        rows = np.concatenate([_ends(finals, member) for member in np.unique(runs.configuration)])
+        finals |= arrays_of(driver.slots.states().train_states.actor)
+        end_arrays = {f"ends/{name}": np.asarray(x)[rows] for name, x in finals.items()}
         write_arrays(self._parts / f"{runs.name}.npz", curves | end_arrays)
 
     def _write_policies(self, group_plan: GroupPlan, chunks: Sequence[Arrays]) -> None:
@@ -444,13 +432,11 @@ class SweepFiles(Files[Driver]):
             policy_folder = self._folder("policies", f"{configuration_number:03d}")
             config = self._plan.design.configs[configuration_number]
             # ``policy`` is that of the group's first configuration, but for these numbers.
-            traced_settings = {
-                setting_name: getattr(config, setting_name)
-                for setting_name in group_plan.group.settings
-                if setting_name in policy
+            swept = {
+                key: getattr(config, key) for key in group_plan.group.settings if key in policy
             }
             folder = self._folder("policies", policy_folder.name, "policy")
-            save_policy(folder, actor_of(end_arrays), policy | traced_settings)
+            save_policy(folder, actor_of(end_arrays), policy | swept)
             summary = {"status": "finished", "final_returns": returns.tolist()}
             write_json(policy_folder / "summary.json", summary)
             settings = {"env": config.env, "horizon": group_plan.ready.horizon}
@@ -483,28 +469,25 @@ def since_their_end(history: Arrays) -> Arrays:
     # A run that has not ended plays in every block, so env steps that stay the same say that it
     # has; from there on ``cumsum`` keeps the mark.
     env_steps = history["env_steps"]
-    has_ended = np.cumsum(env_steps[1:] == env_steps[:-1], axis=0) > 0
+    ended = np.cumsum(env_steps[1:] == env_steps[:-1], axis=0) > 0
     return {
-        name: np.concatenate([x[:1], np.where(has_ended, x[-1], x[1:])])
-        for name, x in history.items()
+        name: np.concatenate([x[:1], np.where(ended, x[-1], x[1:])]) for name, x in history.items()
     }
 
 
-def join_parts(arrays_of_parts: Sequence[Mapping[str, np.ndarray]]) -> Arrays:
+def join_parts(parts: Sequence[Mapping[str, np.ndarray]]) -> Arrays:
     """Returns several parts as one, sorted by configuration and seed.
 
     A run whose evaluations ended earlier repeats its last.
     """
-    num_evaluations = max(len(part_arrays["eval_return"]) for part_arrays in arrays_of_parts)
+    num_evaluations = max(len(part["eval_return"]) for part in parts)
 
     def joined(name: str) -> np.ndarray:
         # Arrays [E, R] have a row an evaluation, arrays [R] have none.
-        arrays_to_join = [part_arrays[name] for part_arrays in arrays_of_parts]
-        arrays_to_join = [
-            lengthened(x, num_evaluations) if x.ndim > 1 else x for x in arrays_to_join
-        ]
-        return np.concatenate(arrays_to_join, axis=-1)
+        columns = [part[name] for part in parts]
+        columns = [lengthened(x, num_evaluations) if x.ndim > 1 else x for x in columns]
+        return np.concatenate(columns, axis=-1)
 
     # The last key counts first.
     run_order = np.lexsort((joined("seed"), joined("configuration")))
-    return {name: joined(name)[..., run_order] for name in arrays_of_parts[0]}
+    return {name: joined(name)[..., run_order] for name in parts[0]}

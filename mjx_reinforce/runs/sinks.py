@@ -36,10 +36,8 @@ def chart_step(rows: Arrays) -> int:
 
 def measured(rows: Arrays) -> Arrays:
     """Returns the columns [S] of one evaluation that say nothing of when it was."""
-    other_columns = ("seed", "update", *_PROGRESS_COLUMNS)
-    return {
-        name: values.astype(float) for name, values in rows.items() if name not in other_columns
-    }
+    labels = ("seed", "update", *_PROGRESS_COLUMNS)
+    return {name: values.astype(float) for name, values in rows.items() if name not in labels}
 
 
 def scalars(rows: Arrays) -> dict[str, float]:
@@ -59,9 +57,7 @@ def scalars(rows: Arrays) -> dict[str, float]:
         # Of one column alone: an interval takes thousands of resamples.
         if name == "eval_return":
             statistics["iqm_low"], statistics["iqm_high"] = iqm_interval(values)
-        statistics |= {
-            f"seed_{seed_index}": x for seed_index, x in enumerate(values[:MAX_SINGLE_SEEDS])
-        }
+        statistics |= {f"seed_{seed}": x for seed, x in enumerate(values[:MAX_SINGLE_SEEDS])}
         shown_scalars |= {f"{name}/{statistic}": float(x) for statistic, x in statistics.items()}
     return shown_scalars
 
@@ -85,10 +81,8 @@ class TensorBoard:
         folder = directory / "tensorboard"
         folder.mkdir(exist_ok=True)
         # Readers sort the files by name.
-        file_suffix = (
-            f"{int(time.time()):010}.{socket.gethostname()}.{len([*folder.glob(EVENTS)]):04}"
-        )
-        self._path = folder / f"events.out.tfevents.{file_suffix}"
+        suffix = f"{int(time.time()):010}.{socket.gethostname()}.{len([*folder.glob(EVENTS)]):04}"
+        self._path = folder / f"events.out.tfevents.{suffix}"
         self._path.touch()
         self._add(file_version="brain.Event:2")
         # A START makes TensorBoard drop what it has from this step on.

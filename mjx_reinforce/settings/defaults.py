@@ -56,11 +56,9 @@ def _without_facts(row: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in row.items() if name not in _NO_SETTINGS}
 
 
-_SMALLEST_ROWS = {row["task"]: row for row in _ROWS if "at_least" not in row}
+_SMALLEST = {row["task"]: row for row in _ROWS if "at_least" not in row}
 #: Environment id -> the settings that differ from those of ``groups``.
-OF_TASKS: dict[str, dict[str, Any]] = {
-    task: _without_facts(row) for task, row in _SMALLEST_ROWS.items()
-}
+OF_TASKS: dict[str, dict[str, Any]] = {task: _without_facts(row) for task, row in _SMALLEST.items()}
 #: Environment id -> from so many env steps of a seed on, what else differs.
 OF_BUDGETS: dict[str, list[tuple[int, dict[str, Any]]]] = {}
 for _row in _ROWS:
@@ -68,7 +66,7 @@ for _row in _ROWS:
         OF_BUDGETS.setdefault(_row["task"], []).append((_row["at_least"], _without_facts(_row)))
 #: Environment id -> the env steps of a seed that a default run trains, on a CPU and on a GPU.
 MINUTES: dict[str, tuple[int, int]] = {
-    task: row["minute"] for task, row in _SMALLEST_ROWS.items() if "minute" in row
+    task: row["minute"] for task, row in _SMALLEST.items() if "minute" in row
 }
 
 #: Where a budget is large, it has about so many evaluations.
@@ -104,13 +102,11 @@ def of_task(
       >>> dataclasses.replace(config, num_seeds=8).num_seeds, config.env_steps
       (8, 20000)
     """
-    smallest_config = dataclasses.replace(
-        Config(env=env, num_seeds=num_seeds), **OF_TASKS.get(env, {})
-    )
-    config = smallest_config
+    base = dataclasses.replace(Config(env=env, num_seeds=num_seeds), **OF_TASKS.get(env, {}))
+    config = base
     speeds = MINUTES.get(env)
     if env_steps is None and minutes is None and not speeds:
-        return smallest_config
+        return base
     # Env steps of a seed in a minute. Of small tasks none are measured, for their default run is
     # shorter; of a task of the user's own nobody knows, and the default budget stands for them.
     if speeds:
@@ -122,14 +118,14 @@ def of_task(
     elif env in HORIZONS:
         minute_steps = _PLENTY
     else:
-        minute_steps = smallest_config.env_steps or 0
+        minute_steps = base.env_steps or 0
     budget = env_steps
     if budget is None:
         budget = max(1, round(minute_steps * (1 if minutes is None else minutes)))
     for min_steps, settings in OF_BUDGETS.get(env, ()):
         # On a GPU few episodes take as long as many.
         if budget >= min_steps or (env_steps is None and has_gpu()):
-            config = dataclasses.replace(smallest_config, **settings)
+            config = dataclasses.replace(base, **settings)
     config = dataclasses.replace(config, env_steps=budget)
     # After its decay a run would go on at the final learning rate, which is the lowest.
     if isinstance(config.decay_steps, int) and config.decay_steps < budget:

@@ -65,7 +65,7 @@ def build(
     normalize_steps = config.normalize_steps
     if normalize_steps is None:  # without end
         normalize_steps = math.inf
-    common_arguments = {  # of all algorithms, the user's too
+    common = {  # of all algorithms, the user's too
         "policy": policy,
         "horizon": training_horizon,
         "normalize_steps": normalize_steps,
@@ -73,17 +73,15 @@ def build(
         "engine": config.engine,
     }
     if is_own(config.algorithm):
-        learner = _call_choice(
-            "algorithm", config.algorithm, ALGORITHMS, env, config, **common_arguments
-        )
+        learner = _call_choice("algorithm", config.algorithm, ALGORITHMS, env, config, **common)
         # What the user's code returns fails here in one line, not inside of a program.
         wrappers.check_learner(config.algorithm, learner)
         return learner, horizon
     algorithm = find_algorithm(config.algorithm)
-    learner = load_definition(algorithm.make)(env, config, **common_arguments)
+    learner = load_definition(algorithm.make)(env, config, **common)
     # A search plays no ``Trajectory`` of one policy, which the wrappers take.
     if not algorithm.search_episodes:
-        learner = _for_many_seeds(learner, config, common_arguments["horizon"], devices)
+        learner = _for_many_seeds(learner, config, common["horizon"], devices)
     return learner, horizon
 
 
@@ -159,10 +157,8 @@ def _build_estimator(config: Config, horizon: int) -> Estimator:
         estimator = _build_value_baseline(config, horizon)
     elif is_own(config.estimator):
         estimator = _call_choice("estimator", config.estimator, ESTIMATORS, config.discount)
-        estimator_call = "mjx_reinforce.reward_to_go(0.99)"
-        check_kind(
-            f"what {config.estimator} returns", estimator, estimators.Estimator, estimator_call
-        )
+        example = "mjx_reinforce.reward_to_go(0.99)"
+        check_kind(f"what {config.estimator} returns", estimator, estimators.Estimator, example)
     else:
         estimator = load_definition(ESTIMATORS[config.estimator])(config.discount)
     if config.standardize_floor is None:
@@ -184,35 +180,30 @@ def _build_value_baseline(config: Config, horizon: int) -> Estimator:
 
 def _build_optimizer(config: Config, space: Box | Discrete) -> optax.GradientTransformation:
     """Returns the optimizer of the settings, with the schedules behind it."""
-    learning_rate = config.learning_rate
+    rate = config.learning_rate
     final_rate = config.final_learning_rate
     if final_rate is None:
-        final_rate = learning_rate / 10
+        final_rate = rate / 10
     optimizer = make_optimizer(
-        config.optimizer,
-        learning_rate,
-        max_grad_norm=config.max_grad_norm,
-        momentum=config.momentum,
+        config.optimizer, rate, max_grad_norm=config.max_grad_norm, momentum=config.momentum
     )
     if config.update == "natural-gradient":
         # Its steps have their length from max_kl; of that a decaying rate leaves a share.
-        optimizer = optax.chain(optax.sgd(learning_rate), optax.scale(1 / config.learning_rate))
+        optimizer = optax.chain(optax.sgd(rate), optax.scale(1 / config.learning_rate))
     if config.decay_steps is None:
         return optimizer
-    decay_steps = config.decay_steps
-    if decay_steps == "budget":  # as long as that, of env steps or updates
-        decay_steps = None
+    steps = config.decay_steps
+    if steps == "budget":  # as long as that, of env steps or updates
+        steps = None
     # Behind the optimizer: Adam would divide a factor on its gradients out again.
-    optimizer = optax.chain(
-        optimizer, schedules.decay_rate(final_rate / learning_rate, decay_steps)
-    )
+    optimizer = optax.chain(optimizer, schedules.decay_rate(final_rate / rate, steps))
     if config.final_std is None:
         return optimizer
     initial_std = config.initial_std
     if initial_std is None:  # a trained deviation has bounds of actions, or none
         initial_std = default_std(cast(Box, space))
     ratio = config.final_std / initial_std
-    return optax.chain(optimizer, schedules.shrink_std(ratio, decay_steps))
+    return optax.chain(optimizer, schedules.shrink_std(ratio, steps))
 
 
 def _build_update(config: Config, policy: Policy) -> Update:

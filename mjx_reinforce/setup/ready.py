@@ -285,23 +285,20 @@ def describe_tree(tree: PyTree) -> Any:
         return None
     if isinstance(tree, dict):
         return {"dict": {name: describe_tree(x) for name, x in tree.items()}}
-    tree_class = type(tree)
+    owner = type(tree)
     field_names = _fields(tree)
     # Classes are named, and loaded by that name; a name in a file must not load any code there is.
     if field_names is not None:
-        if tree_class.__module__.partition(".")[0] not in _PACKAGES:
-            raise TypeError(f"{tree_class} is of another package than {', '.join(_PACKAGES)}")
-        if "." in tree_class.__qualname__:
-            raise TypeError(f"{tree_class} is not at the top of its module")
-        field_descriptions = {name: describe_tree(getattr(tree, name)) for name in field_names}
-        return {
-            "class": f"{tree_class.__module__}:{tree_class.__qualname__}",
-            "fields": field_descriptions,
-        }
+        if owner.__module__.partition(".")[0] not in _PACKAGES:
+            raise TypeError(f"{owner} is of another package than {', '.join(_PACKAGES)}")
+        if "." in owner.__qualname__:
+            raise TypeError(f"{owner} is not at the top of its module")
+        members = {name: describe_tree(getattr(tree, name)) for name in field_names}
+        return {"class": f"{owner.__module__}:{owner.__qualname__}", "fields": members}
     if isinstance(tree, tuple | list):
-        return {tree_class.__name__: [describe_tree(x) for x in tree]}
+        return {owner.__name__: [describe_tree(x) for x in tree]}
     if not hasattr(tree, "shape"):
-        raise TypeError(f"a leaf of {tree_class}")
+        raise TypeError(f"a leaf of {owner}")
     return {"leaf": "key" if is_key(tree) else np.dtype(tree.dtype).name, "shape": list(tree.shape)}
 
 

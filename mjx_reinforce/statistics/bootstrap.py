@@ -28,13 +28,11 @@ def draws(num_seeds: int) -> np.ndarray:
     block_size = max(1, _DRAWS // num_seeds)
     # Blocks draw what one call would: the generator fills its arrays in the order of their rows.
     for start in range(0, RESAMPLES, block_size):
-        drawn_seeds = random.integers(0, num_seeds, (min(block_size, RESAMPLES - start), num_seeds))
+        seeds = random.integers(0, num_seeds, (min(block_size, RESAMPLES - start), num_seeds))
         # Each resample counts in numbers of its own, so that one call counts all of the block.
-        drawn_seeds += num_seeds * np.arange(len(drawn_seeds))[:, None]
-        seed_counts = np.bincount(drawn_seeds.ravel(), minlength=drawn_seeds.size).reshape(
-            drawn_seeds.shape
-        )
-        draw_counts[:, start : start + len(drawn_seeds)] = seed_counts.T
+        seeds += num_seeds * np.arange(len(seeds))[:, None]
+        seed_counts = np.bincount(seeds.ravel(), minlength=seeds.size).reshape(seeds.shape)
+        draw_counts[:, start : start + len(seeds)] = seed_counts.T
     # The cache hands the same array to everyone.
     draw_counts.flags.writeable = False
     return draw_counts

@@ -270,13 +270,9 @@ def _power_by_seeds(x: np.ndarray, y: np.ndarray, alpha: float) -> np.ndarray:
     variances = []
     for values in (x, y):
         # About the middle, so that a sum of squares less a square of sums keeps its digits.
-        drawn_values = (
-            values[random.integers(0, len(values), (_EXPERIMENTS, _DRAWN_SEEDS))] - middle
-        )
+        samples = values[random.integers(0, len(values), (_EXPERIMENTS, _DRAWN_SEEDS))] - middle
         # An experiment of n seeds is the first n draws of a row: one set of draws for all n.
-        sums, squares = (
-            np.cumsum(power, axis=1)[:, 1:] for power in (drawn_values, drawn_values**2)
-        )
+        sums, squares = (np.cumsum(power, axis=1)[:, 1:] for power in (samples, samples**2))
         means.append(sums / count)
         spread = np.maximum(squares - sums**2 / count, 0)
         variances.append(spread / (count - 1) / count)  # of the mean

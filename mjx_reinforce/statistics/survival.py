@@ -239,13 +239,11 @@ def _half_solved(steps: ArrayLike, solved: ArrayLike) -> float:
     steps = np.asarray(steps, float)
     solved = np.asarray(solved, bool)
     times, events = np.unique(steps[solved], return_counts=True)
-    num_at_risk = len(steps) - np.searchsorted(np.sort(steps), times)
+    at_risk = len(steps) - np.searchsorted(np.sort(steps), times)
     # The share is numerator / denominator, in Python's integers, which have no end.
     numerator = 1
     denominator = 1
-    for time, risk, count in zip(
-        times.tolist(), num_at_risk.tolist(), events.tolist(), strict=True
-    ):
+    for time, risk, count in zip(times.tolist(), at_risk.tolist(), events.tolist(), strict=True):
         numerator *= risk - count
         denominator *= risk
         if 2 * numerator <= denominator:

@@ -71,12 +71,9 @@ class Division:
             return devices.jit(program, in_specs, out_specs)
         # All devices get all seeds. A function that divides episodes maps that alone over them;
         # XLA divides what follows from the episodes.
-        replicated_shardings = devices.shardings(NONE)
+        replicas = devices.shardings(NONE)
         if by_episodes:
-            shardings = {
-                "in_shardings": replicated_shardings,
-                "out_shardings": replicated_shardings,
-            }
+            shardings = {"in_shardings": replicas, "out_shardings": replicas}
             return jax.jit(program, **shardings)
         return devices.jit(program, NONE, NONE)
 

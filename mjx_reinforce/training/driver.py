@@ -425,34 +425,28 @@ def env_steps_in(
     """
     max_updates = MAX_COUNT if config.max_updates is None else config.max_updates
     start_time = time.perf_counter()
-    trial_moments = [_Moment.of(0.0, slots)]
+    moments = [_Moment.of(0.0, slots)]
     # Calls of 1, 2, 4, ... updates: nobody knows yet how long one takes, and so the last call is
     # about half of the trial.
-    while trial_moments[-1].seconds < _TRIAL_SHARE * seconds and not (
-        trial_moments[1:] and interrupted()
-    ):
-        num_updates = 2 ** (len(trial_moments) - 1)
-        slots.budget = Budget.of(None, min(trial_moments[-1].updates + num_updates, max_updates))
+    while moments[-1].seconds < _TRIAL_SHARE * seconds and not (moments[1:] and interrupted()):
+        num_updates = 2 ** (len(moments) - 1)
+        slots.budget = Budget.of(None, min(moments[-1].updates + num_updates, max_updates))
         if not slots.advance(evaluate=False):
             break  # no seed has an update left
-        trial_moments.append(_Moment.of(time.perf_counter() - start_time, slots))
-    start = trial_moments[0]
-    last_moment = trial_moments[-1]
-    if len(trial_moments) == 1:
+        moments.append(_Moment.of(time.perf_counter() - start_time, slots))
+    start = moments[0]
+    end = moments[-1]
+    if len(moments) == 1:
         return max(1, round(start.env_steps))
     # The last call alone, if no moment before it is in the second half.
-    middle_moment = next(
-        (x for x in trial_moments[1:-1] if x.seconds >= last_moment.seconds / 2), trial_moments[-2]
-    )
-    elapsed_seconds = last_moment.seconds - middle_moment.seconds
+    middle = next((x for x in moments[1:-1] if x.seconds >= end.seconds / 2), moments[-2])
+    elapsed = end.seconds - middle.seconds
     # The trial was not evaluated. The run is, after every block, and stands still meanwhile unless
     # evaluations share the launches of updates.
-    block_seconds = (
-        config.block_length * elapsed_seconds / (last_moment.updates - middle_moment.updates)
-    )
+    block_seconds = config.block_length * elapsed / (end.updates - middle.updates)
     eval_seconds = slots.seconds_to_evaluate()
-    env_steps_per_second = (last_moment.env_steps - middle_moment.env_steps) / elapsed_seconds
+    env_steps_per_second = (end.env_steps - middle.env_steps) / elapsed
     env_steps_per_second = env_steps_per_second * block_seconds / (block_seconds + eval_seconds)
     # The trial took its time, and what it trained is undone: the run goes on from its start.
-    remaining_seconds = max(seconds - last_moment.seconds - eval_seconds, 0.0)
+    remaining_seconds = max(seconds - end.seconds - eval_seconds, 0.0)
     return min(max(1, round(start.env_steps + env_steps_per_second * remaining_seconds)), MAX_COUNT)

@@ -81,16 +81,12 @@ def block_of_updates(
             """Makes one update, and writes its metrics as a row."""
             state, (num_updates, rows, eval_metrics) = carry
             state, row, measured = update(state, budget, evaluation_due & (num_updates == 0))
-            write_row = functools.partial(
-                lax.dynamic_update_index_in_dim, index=num_updates, axis=0
-            )
+            store = functools.partial(lax.dynamic_update_index_in_dim, index=num_updates, axis=0)
             # The first update alone evaluates; what the others return as measured is void.
             eval_metrics = jax.tree.map(
-                lambda x, old_metrics: jnp.where(num_updates == 0, x, old_metrics),
-                measured,
-                eval_metrics,
+                lambda x, old: jnp.where(num_updates == 0, x, old), measured, eval_metrics
             )
-            return state, Block(num_updates + 1, jax.tree.map(write_row, rows, row), eval_metrics)
+            return state, Block(num_updates + 1, jax.tree.map(store, rows, row), eval_metrics)
 
         # The loop writes into arrays of a fixed length: XLA knows no others. Rows after the last
         # update stay zero, so that "active" is False there.
@@ -134,13 +130,11 @@ def _update_of_runs(
     def update(state: RunState, budget: Budget, evaluation_due: jax.Array) -> Any:
         """Makes one update of all runs [R] that have budget left; results as of ``step``."""
         # Schedules, such as the learning rate's, go by a share that learners do not know.
-        old_train_states = dataclasses.replace(
-            state.train_states, progress=_progress(state, budget)
-        )
+        old_states = dataclasses.replace(state.train_states, progress=_progress(state, budget))
         active = _active(state, budget)
         evaluation_due = jnp.broadcast_to(evaluation_due, len(state.eval_keys))
         train_states, metrics, eval_metrics = jax.vmap(step)(
-            old_train_states, state.settings, active, state.eval_keys, evaluation_due
+            old_states, state.settings, active, state.eval_keys, evaluation_due
         )
         return dataclasses.replace(state, train_states=train_states), metrics, eval_metrics
 
@@ -316,7 +310,7 @@ def programs_of(
     horizon: int,
     config: Config,
     num_runs: int,
-    traced_settings: Collection[str] = (),
+    traced: Collection[str] = (),
     *,
     all_metrics: bool = True,
     division: Division = ALONE,
@@ -329,7 +323,7 @@ def programs_of(
       horizon: T, the time limit of an episode in steps.
       config: the settings, in which those that are traced stand for any value.
       num_runs: R, of the shapes; those of one device.
-      traced_settings: the names of the settings that differ from run to run.
+      traced: the names of the settings that differ from run to run.
       all_metrics: whether all is measured that ``metrics.csv`` has. Else evaluations play the
         policy's mode alone, and of the metrics those of ``_PROGRESS_METRICS`` are returned.
       division: among which devices the runs are divided.
@@ -373,9 +367,7 @@ def programs_of(
 
     # The functions above read ``state_rows`` when they are traced, which is later.
     numbers = jax.ShapeDtypeStruct((num_runs,), np.uint32)
-    settings = {
-        name: jax.ShapeDtypeStruct((num_runs,), jnp.result_type(float)) for name in traced_settings
-    }
+    settings = {name: jax.ShapeDtypeStruct((num_runs,), jnp.result_type(float)) for name in traced}
     state_shapes = jax.eval_shape(states, np.uint32(0), numbers, settings)
     state_rows = StateRows(state_shapes)
     return Programs(begin, advance, evaluate_rows, advance_evaluates, state_shapes, division)

@@ -81,11 +81,8 @@ def _cells(values: np.ndarray) -> Sequence[str]:
         return [*map(str, values.tolist())]
     # Nine digits tell any two float32 apart. A thousand in one format take 0.2 ms; one by one with
     # all digits of a double, 1 ms.
-    number_texts = ("%.9g\n" * len(values) % tuple(values.tolist())).split()
-    return [
-        f"{number_text}.0" if number_text.lstrip("-").isdigit() else number_text
-        for number_text in number_texts
-    ]
+    texts = ("%.9g\n" * len(values) % tuple(values.tolist())).split()
+    return [f"{text}.0" if text.lstrip("-").isdigit() else text for text in texts]
 
 
 #: The time left is estimated from so many of the latest evaluations: episodes change their length.
@@ -182,9 +179,9 @@ def describe_nonfinite(num_nonfinite: np.ndarray, first_seed: int, updates: int)
     noun = "number" if len(seeds) == 1 else "numbers"
     return (
         f"up to update {updates}, {len(seeds):,} of {len(num_nonfinite):,} seeds ({noun} "
-        f"{seed_list}) met values that are not finite or beyond 1e10. Such an episode counts as the worst of its "
-        "update. This line comes once; the number of such updates comes at the end. If they are "
-        "many, give the model a smaller timestep or more armature, or lower --learning-rate"
+        f"{seed_list}) met values that are not finite or beyond 1e10. Such an episode counts as "
+        "the worst of its update. This line comes once; the number of such updates comes at the "
+        "end. If they are many, give the model a smaller timestep or more armature, or lower --learning-rate"
     )
 
 
@@ -228,22 +225,20 @@ class Record:
             record_arrays |= {f"{table}.{name}": x for name, x in self._columns(table).items()}
         return record_arrays
 
-    def restore(self, record_arrays: Mapping[str, np.ndarray]) -> None:
+    def restore(self, saved: Mapping[str, np.ndarray]) -> None:
         """Goes back to what a record of the same settings had measured.
 
         Args:
-          record_arrays: from its ``arrays``.
+          saved: from its ``arrays``.
         """
         # Counts change in place, so they are copied; without an axis they were Python's ints.
         for name in self._saved:
-            saved_array = record_arrays[name]
+            saved_array = saved[name]
             setattr(self, name, saved_array.copy() if saved_array.ndim else saved_array.item())
         # A table that had no rows has no columns, either.
         for table in self._tables:
             prefix = f"{table}."
-            columns = {
-                n.removeprefix(prefix): x for n, x in record_arrays.items() if n.startswith(prefix)
-            }
+            columns = {n.removeprefix(prefix): x for n, x in saved.items() if n.startswith(prefix)}
             self._tables[table] = [columns] if columns else []
 
     def _columns(self, table: str) -> Arrays:
@@ -357,10 +352,8 @@ class Record:
 
         That is ``eval_return``, the ``env_steps`` until then and, of a run, ``episodes``.
         """
-        evaluations = self._columns("evaluations")
-        return {
-            n: evaluations[n] for n in ("eval_return", "env_steps", "episodes") if n in evaluations
-        }
+        table = self._columns("evaluations")
+        return {n: table[n] for n in ("eval_return", "env_steps", "episodes") if n in table}
 
 
 class RunRecord(Record):
@@ -455,26 +448,24 @@ class RunRecord(Record):
           Its rows in metrics.csv.
         """
         eval_metrics = measured.eval_metrics
-        count_columns = {"env_steps": self.env_steps, "episodes": self.episodes}
-        self._append(
-            **eval_metrics, **count_columns, updates=self.updates, seconds=np.array(seconds)
-        )
+        counts = {"env_steps": self.env_steps, "episodes": self.episodes}
+        self._append(**eval_metrics, **counts, updates=self.updates, seconds=np.array(seconds))
         self.count_steps(eval_metrics)
         self.returns = eval_metrics["eval_return"]
         self.seen = self.env_steps.copy()
         # Columns of metrics.csv are singular: a row is of one update of one seed.
         seeds = self.config.first_seed + np.arange(len(self.updates))
-        count_columns |= {"seed": seeds, "update": self.updates}
+        counts |= {"seed": seeds, "update": self.updates}
         last_metrics = {name: x[0] for name, x in self._columns("last").items()}
-        return as_rows(last_metrics | eval_metrics | count_columns, seconds)
+        return as_rows(last_metrics | eval_metrics | counts, seconds)
 
     def progress(self) -> Progress:
         """Returns how far the run is, right after an evaluation."""
         names = ("env_steps", "updates", "seconds")
         # A piece may have one row or all of the past: each is cut, then they are joined and cut.
-        latest_tables = self._tables["evaluations"][-_NUM_LATEST:]
+        tables = self._tables["evaluations"][-_NUM_LATEST:]
         latest_columns = _joined(
-            [{name: table[name][-_NUM_LATEST:] for name in names} for table in latest_tables]
+            [{name: table[name][-_NUM_LATEST:] for name in names} for table in tables]
         )
         latest_rows = {name: x[-_NUM_LATEST:] for name, x in latest_columns.items()}
         budget_shares = used(self.config, latest_rows["env_steps"], latest_rows["updates"])

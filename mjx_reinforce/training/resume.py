@@ -156,35 +156,33 @@ def check_same_program(
       present_record: what ``provenance`` returns.
     """
     for name in (name for name in _DECISIVE_ENTRIES if name in present_record):
-        recorded_entry = record.get(name)
-        present_entry = present_record[name]
+        old_entry = record.get(name)
+        new_entry = present_record[name]
         if name == "xla_flags":
-            recorded_entry = _without_devices(recorded_entry)
-            present_entry = _without_devices(present_entry)
+            old_entry = _without_devices(old_entry)
+            new_entry = _without_devices(new_entry)
         # Of versions and JAX's settings the message names the first one that differs.
-        if isinstance(recorded_entry, dict) and isinstance(present_entry, dict):
+        if isinstance(old_entry, dict) and isinstance(new_entry, dict):
             changed_keys = [
                 key
-                for key in {**recorded_entry, **present_entry}
-                if recorded_entry.get(key) != present_entry.get(key)
+                for key in {**old_entry, **new_entry}
+                if old_entry.get(key) != new_entry.get(key)
             ]
             if changed_keys:
                 name = changed_keys[0]
-                recorded_entry = recorded_entry.get(name)
-                present_entry = present_entry.get(name)
-        if recorded_entry != present_entry:
+                old_entry = old_entry.get(name)
+                new_entry = new_entry.get(name)
+        if old_entry != new_entry:
             raise ValueError(
-                f"{directory} was begun with {name} {recorded_entry}, and here it is "
-                f"{present_entry}, so its numbers would change; resume where it was begun, or start another run"
+                f"{directory} was begun with {name} {old_entry}, and here it is {new_entry}, so "
+                "its numbers would change; resume where it was begun, or start another run"
             )
 
 
 def _without_devices(flags: object) -> str:
     """Returns XLA_FLAGS without the number of a CPU's devices, with which a run may go on."""
-    flag_words = str(flags or "").split()
-    return " ".join(
-        flag_word for flag_word in flag_words if not flag_word.startswith(f"{_DEVICES_FLAG}=")
-    )
+    words = str(flags or "").split()
+    return " ".join(word for word in words if not word.startswith(f"{_DEVICES_FLAG}="))
 
 
 _NUM_NEWEST = 2

@@ -141,18 +141,14 @@ class Slots:
         slot_width = compiled.width
         num_runs = len(seed_numbers)
         dtype = jnp.result_type(float)
-        settings = {
-            name: setting_values.astype(dtype) for name, setting_values in (settings or {}).items()
-        }
+        settings = {name: values.astype(dtype) for name, values in (settings or {}).items()}
         seed = division.put(np.uint32(compiled.config.seed), NONE)
         first_slots = []
         # The last slot may be wider than what is left of the runs: its last run fills it up, and
         # is cut off again below. The order of runs changes nothing: each has its number's keys.
         for start in range(0, num_runs, slot_width):
             runs = np.minimum(np.arange(start, start + slot_width), num_runs - 1)
-            slot_settings = division.put(
-                {name: setting_values[runs] for name, setting_values in settings.items()}
-            )
+            slot_settings = division.put({name: values[runs] for name, values in settings.items()})
             slot_numbers = division.put(seed_numbers[runs].astype(np.uint32))
             first_slots.append(compiled.begin(seed, slot_numbers, slot_settings))
         rows, keys = zip(*jax.device_get(first_slots), strict=True)
@@ -323,15 +319,12 @@ def _of_slots(slots: np.ndarray, measured: Sequence[tuple[Arrays, Arrays]]) -> M
     """
     runs = slots.reshape(-1)
     # Empty places, -1, are sorted to the front and cut off.
-    run_order = np.argsort(runs, kind="stable")[np.sum(runs < 0) :]
+    order = np.argsort(runs, kind="stable")[np.sum(runs < 0) :]
     metrics, eval_metrics = (
-        {
-            name: np.concatenate([x[name] for x in slot_metrics], axis=-1)[..., run_order]
-            for name in slot_metrics[0]
-        }
-        for slot_metrics in zip(*measured, strict=True)
+        {name: np.concatenate([x[name] for x in group], axis=-1)[..., order] for name in group[0]}
+        for group in zip(*measured, strict=True)
     )
-    return Measured(runs[run_order], metrics, eval_metrics)
+    return Measured(runs[order], metrics, eval_metrics)
 
 
 def compile_slots(programs: Programs, config: Config, width: int) -> Compiled:

@@ -52,11 +52,9 @@ class Budget(NamedTuple):
         return cls(*map(counts.from_int, budget_limits))
 
 
-def shape_of_all(state_shapes: RunState, num_runs: int) -> RunState:
+def shape_of_all(shapes: RunState, num_runs: int) -> RunState:
     """Returns the shapes of the states of so many runs, from those of some."""
-    return jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct((num_runs, *x.shape[1:]), x.dtype), state_shapes
-    )
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_runs, *x.shape[1:]), x.dtype), shapes)
 
 
 class StateRows:
@@ -245,9 +243,7 @@ def last_actors(config: Config, policy: Mapping[str, Any]) -> Actor:
 def begin_with(state: RunState, actors: Actor) -> RunState:
     """Returns the state of a run before its first update, with actors [S, ...] of another."""
     init_actor = state.train_states.actor
-    actor = jax.tree.map(
-        lambda leaf, init_leaf: np.asarray(leaf, init_leaf.dtype), actors, init_actor
-    )
+    actor = jax.tree.map(lambda leaf, first: np.asarray(leaf, first.dtype), actors, init_actor)
     return dataclasses.replace(
         state, train_states=dataclasses.replace(state.train_states, actor=actor)
     )

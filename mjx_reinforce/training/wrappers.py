@@ -161,7 +161,7 @@ class SharedLaunch:
         evaluation: Any,
         limit: Any,
         keys: Any,
-        active_episodes: Any,
+        active: Any,
     ) -> SharedEpisodes:
         """Plays episodes of these keys, as far as they are chosen, after those of an evaluation.
 
@@ -180,15 +180,13 @@ class SharedLaunch:
             num_evaluated = len(eval_keys)
             # Its episodes come first, so that a slice takes either kind below.
             modes = jnp.concatenate([eval_modes, jnp.zeros(len(keys), bool)])
-            active_episodes = jnp.concatenate(
-                [jnp.broadcast_to(eval_active, num_evaluated), active_episodes]
-            )
+            active = jnp.concatenate([jnp.broadcast_to(eval_active, num_evaluated), active])
             if limit is not None:
                 training_limit = jnp.broadcast_to(limit, len(keys))
                 limit = jnp.concatenate([jnp.full(num_evaluated, horizon), training_limit])
             keys = jnp.concatenate([eval_keys, keys])
         episodes = play(
-            actor, keys, horizon=horizon, deterministic=modes, active=active_episodes, limit=limit
+            actor, keys, horizon=horizon, deterministic=modes, active=active, limit=limit
         )
         if self.devices is not None:
             # Each has counted its own; the metrics of an update have the steps of all.

@@ -207,10 +207,8 @@ def render_chart(chart: Chart, labels: Sequence[str], title: str) -> dict[str, b
 
 def slider_stops(findings: Findings) -> list[int]:
     """Returns the points of the grid that the slider stops at."""
-    last_index = len(findings.grid) - 1
-    return np.unique(
-        np.linspace(0, last_index, min(_MOMENTS, last_index + 1)).round().astype(int)
-    ).tolist()
+    last = len(findings.grid) - 1
+    return np.unique(np.linspace(0, last, min(_MOMENTS, last + 1)).round().astype(int)).tolist()
 
 
 def tooltip(**fields: tuple[str, str]) -> list[Spec]:
@@ -279,12 +277,8 @@ def threshold_line(findings: Findings, axis: str, drawn_returns: np.ndarray) -> 
     There is none beyond the returns that are drawn: axes end where the data do.
     """
     threshold = findings.experiment.threshold
-    finite_returns = drawn_returns[np.isfinite(drawn_returns)]
-    if (
-        threshold is None
-        or not finite_returns.size
-        or not finite_returns.min() <= threshold <= finite_returns.max()
-    ):
+    heights = drawn_returns[np.isfinite(drawn_returns)]
+    if threshold is None or not heights.size or not heights.min() <= threshold <= heights.max():
         return []
     # Below the line, at its end: curves come from below and end above.
     position = {"x": {"value": {"expr": "width - 4"}}}

@@ -24,11 +24,9 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
     returns = [result.configuration.eval_return.ravel() for result in findings.results]
     threshold_layers = charts.threshold_line(findings, "y", np.concatenate(returns))
     # Who looks for the line has to be told why there is none.
-    threshold_note = ""
+    note = ""
     if threshold is not None and not threshold_layers:
-        threshold_note = (
-            f" The return that counts as solved, {number(threshold)}, lies beyond the figure."
-        )
+        note = f" The return that counts as solved, {number(threshold)}, lies beyond the figure."
     layers = [
         # Single seeds lie below the band, which would be hidden by hundreds of them.
         {
@@ -40,12 +38,10 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
     ]
     bands = _bands(findings)
     interval = ", and its 95% bootstrap interval" if charts.has_width(bands) else ""
-    lines_note = "Thin lines are single seeds, from worst to best."
+    lines = "Thin lines are single seeds, from worst to best."
     if len(findings.results) > 1:
         # Seeds of several would cover each other: `_lines_of_seeds` draws those of one alone.
-        lines_note = (
-            "With one configuration shown, thin lines are single seeds, from worst to best."
-        )
+        lines = "With one configuration shown, thin lines are single seeds, from worst to best."
     yield charts.make_chart(
         findings,
         layers,
@@ -54,7 +50,7 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         title="Learning curves",
         caption=(
             f"The interquartile mean over seeds of the return without exploration{interval}. "
-            f"{lines_note} Point at a curve to read it.{threshold_note}"
+            f"{lines} Point at a curve to read it.{note}"
         ),
         alt="Return over env steps, a line for each configuration that is shown.",
         data={"curves": bands, "seeds": _seeds(findings)},
@@ -91,12 +87,8 @@ def picture(env: str, threshold: float | None, history: dict[str, np.ndarray]) -
     if enough(num_seeds):
         title += " and its 95% interval"
     # A threshold far away would press the curves into a corner.
-    finite_returns = returns[np.isfinite(returns)]
-    if (
-        threshold is not None
-        and finite_returns.size
-        and finite_returns.min() <= threshold <= finite_returns.max()
-    ):
+    heights = returns[np.isfinite(returns)]
+    if threshold is not None and heights.size and heights.min() <= threshold <= heights.max():
         axes.axhline(threshold, color="0.3", linestyle="--", linewidth=1, label="solved")
         axes.legend(frameon=False)
     axes.set(title=f"{env}: {title}", xlabel="env steps per seed", ylabel=_RETURN)
