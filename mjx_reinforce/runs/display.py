@@ -157,11 +157,13 @@ class Display(Observer[RunDriver]):
                 f"{returns_and_speed}  {percent}  {time_left}".rstrip()
             )
 
-    def updated(self, driver: RunDriver, failures: np.ndarray) -> None:
+    def updated(self, driver: RunDriver, num_nonfinite: np.ndarray) -> None:
         """Says once which seeds met numbers that are not finite; the last table counts them."""
-        if failures.any() and not self._nonfinite_shown:
+        if num_nonfinite.any() and not self._nonfinite_shown:
             self._nonfinite_shown = True
-            text = record.describe_nonfinite(failures, driver.config.first_seed, driver.updates())
+            text = record.describe_nonfinite(
+                num_nonfinite, driver.config.first_seed, driver.updates()
+            )
             self.say(text, "yellow")
 
     def evaluated(self, driver: RunDriver, evaluation: Evaluation, rows: Arrays) -> None:

@@ -181,7 +181,8 @@ def describe_nonfinite(num_nonfinite: np.ndarray, first_seed: int, updates: int)
         f"up to update {updates}, {len(seeds):,} of {len(num_nonfinite):,} seeds ({noun} "
         f"{seed_list}) met values that are not finite or beyond 1e10. Such an episode counts as "
         "the worst of its update. This line comes once; the number of such updates comes at the "
-        "end. If they are many, give the model a smaller timestep or more armature, or lower --learning-rate"
+        "end. If they are many, give the model a smaller timestep or more armature, or lower "
+        "--learning-rate"
     )
 
 
