@@ -93,8 +93,8 @@ def _settings(env: "Environment") -> list[str]:
     settings = getattr(env, "settings", None)
     if not dataclasses.is_dataclass(settings):
         return []
-    fields = dataclasses.fields(settings)
-    lines = [f"  {f.name}={_as_text(getattr(settings, f.name))}" for f in fields if f.init]
+    init_fields = dataclasses.fields(settings)
+    lines = [f"  {f.name}={_as_text(getattr(settings, f.name))}" for f in init_fields if f.init]
     return ["\n".join(["Its settings, which --env-set NAME=VALUE changes:", *lines])]
 
 

@@ -89,8 +89,8 @@ def _is_sound(data: mjx.Data) -> jax.Array:
 
     C looks at positions and velocities when the next step begins, which may be one step later.
     """
-    numbers = data.qpos, data.qvel, data.qacc
-    return functools.reduce(jnp.logical_and, (jnp.all(jnp.abs(x) <= mjMAXVAL) for x in numbers))
+    arrays = data.qpos, data.qvel, data.qacc
+    return functools.reduce(jnp.logical_and, (jnp.all(jnp.abs(x) <= mjMAXVAL) for x in arrays))
 
 
 class MujocoEnv(Env):
@@ -148,8 +148,10 @@ class MujocoEnv(Env):
         self._start = jax.jit(prune(self._forward_state))
         # A range that is written without a limit counts for nothing in MuJoCo.
         low, high = np.array(self.mj_model.actuator_ctrlrange).T
-        limited = np.array(self.mj_model.actuator_ctrllimited, bool)
-        self.action_space = Box(np.where(limited, low, -np.inf), np.where(limited, high, np.inf))
+        is_limited = np.array(self.mj_model.actuator_ctrllimited, bool)
+        self.action_space = Box(
+            np.where(is_limited, low, -np.inf), np.where(is_limited, high, np.inf)
+        )
 
     @abc.abstractmethod
     def initial(self, rng: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -226,11 +228,11 @@ class MujocoEnv(Env):
 
     def _physics_of(self, episode: dict[str, jax.Array]) -> tuple[Any, Any]:
         """Returns the forward pass and the step of the model as it is in an episode."""
-        fields = models.replaced(self.mj_model, episode)
-        if not fields:
+        model_fields = models.replaced(self.mj_model, episode)
+        if not model_fields:
             return self._forward, self._physics_step
         # Not jitted: they close over this episode's fields, so no trace could be used again.
-        model = self.model.replace(**fields)
+        model = self.model.replace(**model_fields)
         forward = functools.partial(_forward, model)
         return forward, _step_of(model, forward)
 
@@ -238,20 +240,20 @@ class MujocoEnv(Env):
         self, qpos: jax.Array, qvel: jax.Array, episode: dict[str, jax.Array]
     ) -> State:
         """Returns the state at positions and velocities, from one forward pass."""
-        start = models.make_data(self.mj_model).replace(qpos=qpos, qvel=qvel)
+        start_data = models.make_data(self.mj_model).replace(qpos=qpos, qvel=qvel)
         # MJX normalizes quaternions in qpos itself; MuJoCo does so when it steps.
         if self._stays_whole(episode):
-            data, _ = self._whole("start", start)
+            data, _ = self._whole("start", start_data)
         else:
             forward, _ = self._physics_of(episode)
-            data = physics.like(forward(start).replace(qpos=qpos), start)
+            data = physics.like(forward(start_data).replace(qpos=qpos), start_data)
         state = self._physics(data, episode)
         view = View(data, self.mj_model, episode)
         # No env step was made: the outcome says only which terms there are, each 0 so far. Wrappers
         # and loops need a state of one structure from the first step on.
         zero = jnp.zeros((), qpos.dtype)
         action = jnp.zeros(self.action_size, qpos.dtype)
-        terms = self._outcome(state, start, view, action)[2]
+        terms = self._outcome(state, start_data, view, action)[2]
         return State(cast(Any, state), self.observe(view), zero, zero, dict.fromkeys(terms, zero))
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -262,33 +264,33 @@ class MujocoEnv(Env):
         check_shape("the action", action, (self.action_size,))
         before = cast(Any, state.pipeline_state)
         # All else in mjData follows from what is carried, or stays as the model has it.
-        start = models.make_data(self.mj_model).replace(**_carried(before))
+        start_data = models.make_data(self.mj_model).replace(**_carried(before))
         _, physics_step = self._physics_of(before.episode)
 
         def advance(_: int, carry: tuple[mjx.Data, jax.Array]) -> tuple[mjx.Data, jax.Array]:
             """One physics step; sound until the first that C MuJoCo would not have made."""
-            data, sound = carry
+            data, is_sound = carry
             data = physics.like(physics_step(data), data)
-            return data, sound & _is_sound(data)
+            return data, is_sound & _is_sound(data)
 
-        start = start.replace(ctrl=jnp.asarray(action, start.ctrl.dtype))
+        start_data = start_data.replace(ctrl=jnp.asarray(action, start_data.ctrl.dtype))
         if self._stays_whole(before.episode):
-            data, sound = self._whole("physics", start)
+            data, is_sound = self._whole("physics", start_data)
         else:
-            start_of_loop = start, jnp.array(True)
-            data, sound = jax.lax.fori_loop(0, self.frame_skip, advance, start_of_loop)
+            start_of_loop = start_data, jnp.array(True)
+            data, is_sound = jax.lax.fori_loop(0, self.frame_skip, advance, start_of_loop)
             # Once an env step, as Gymnasium's ``do_simulation`` calls it after the last mj_step.
             if self.contact_forces:
                 model = self.model.replace(**models.replaced(self.mj_model, before.episode))
                 data = sensors.rne_postconstraint(model, data)
         view = View(data, self.mj_model, before.episode)
-        reward, terminated, terms = self._outcome(before, start, view, action)
+        reward, terminated, terms = self._outcome(before, start_data, view, action)
         dtype = state.reward.dtype
         return dataclasses.replace(
             state,
             pipeline_state=self._physics(data, before.episode),
             obs=self.observe(view),
-            reward=jnp.where(sound, jnp.asarray(reward, dtype), jnp.nan),
+            reward=jnp.where(is_sound, jnp.asarray(reward, dtype), jnp.nan),
             done=jnp.asarray(terminated, dtype),
             metrics=state.metrics | jax.tree.map(lambda x: jnp.asarray(x, dtype), terms),
         )
@@ -328,15 +330,15 @@ class MujocoEnv(Env):
         """Returns what ``outcome`` returns, or raises ValueError where it is no outcome."""
         constant = {name: getattr(start, name) for name in models.CONSTANT}
         # The state's own come last: a task may have asked to carry one of these, too.
-        fields = constant | state.carried | _carried(state)
-        before = Before(fields, self.mj_model, state.episode)
+        state_fields = constant | state.carried | _carried(state)
+        before = Before(state_fields, self.mj_model, state.episode)
         return check_outcome(type(self).__name__, self.outcome(before, data, action))
 
     def _physics(self, data: mjx.Data, episode: dict[str, jax.Array]) -> Physics:
         """Returns what the next env step needs to know of a simulation."""
         # ``Simulation`` has MuJoCo's names, wherever MJX keeps the fields.
-        carried = {name: getattr(Simulation(data), name) for name in self.carried}
-        return Physics(**_carried(data), carried=carried, episode=episode)
+        carried_fields = {name: getattr(Simulation(data), name) for name in self.carried}
+        return Physics(**_carried(data), carried=carried_fields, episode=episode)
 
     @property
     def dt(self) -> float:

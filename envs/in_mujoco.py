@@ -90,8 +90,8 @@ class InMujoco:
         for name, value in models.replaced(model, self._episode).items():
             getattr(model, name)[:] = value
         if "body_ipos" in self._episode:  # C would take the places of frames that were the same
-            for part in (model.body_sameframe, model.geom_sameframe, model.site_sameframe):
-                part[:] = int(_C.mjtSameFrame.mjSAMEFRAME_NONE)
+            for frame_types in (model.body_sameframe, model.geom_sameframe, model.site_sameframe):
+                frame_types[:] = int(_C.mjtSameFrame.mjSAMEFRAME_NONE)
         data = _C.MjData(model)
         data.qpos[:] = qpos
         data.qvel[:] = qvel
@@ -112,19 +112,19 @@ class InMujoco:
         _C.mj_step(self.model, self.data, self.env.frame_skip)
         if self.env.contact_forces:
             _C.mj_rnePostConstraint(self.model, self.data)
-        observation, reward, ended = self._advance(
+        observation, reward, terminated = self._advance(
             before, self._fields(), self._episode, np.asarray(action)
         )
         # The task would pay for where MuJoCo has put the body back.
         if was_reset(self.data):
             reward = np.nan
-        return np.asarray(observation), float(reward), bool(ended)
+        return np.asarray(observation), float(reward), bool(terminated)
 
     def _outcome(self, before, fields, episode, action):
         data = self._view(fields, episode)
         before = self._view(before, episode)
-        reward, ended, _ = self.env.outcome(before, data, action)
-        return self.env.observe(data), reward, ended
+        reward, terminated, _ = self.env.outcome(before, data, action)
+        return self.env.observe(data), reward, terminated
 
     def _view(self, fields: dict[str, Any], episode: dict[str, Any]) -> Any:
         """Returns fields of mjData as the task reads them."""
@@ -136,8 +136,8 @@ class InMujoco:
 
     def _start_fields(self) -> dict[str, np.ndarray]:
         """Returns what the next outcome may read of the start of an env step."""
-        names = (*models.CARRIED, *models.CONSTANT, *self.env.carried)
-        return {name: self._field(name) for name in names}
+        field_names = (*models.CARRIED, *models.CONSTANT, *self.env.carried)
+        return {name: self._field(name) for name in field_names}
 
     def _field(self, name: str) -> np.ndarray:
         shape = getattr(self._sizes, name)

@@ -96,15 +96,15 @@ def _random(model: MjModel) -> Iterator[np.ndarray]:
     rng = np.random.default_rng(0)
     low, high = _ranges(model)
     # Limits are infinite in pairs; a range that is not used is drawn as [0, 0].
-    bounded = np.isfinite(low)
+    is_bounded = np.isfinite(low)
     while True:
         normal = rng.normal(size=model.nu)
-        inside = rng.uniform(np.where(bounded, low, 0), np.where(bounded, high, 0))
-        yield np.where(bounded, inside, normal)
+        bounded_controls = rng.uniform(np.where(is_bounded, low, 0), np.where(is_bounded, high, 0))
+        yield np.where(is_bounded, bounded_controls, normal)
 
 
 def _ranges(model: MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Returns the least and the largest control [A], infinite where there is no limit."""
     low, high = model.actuator_ctrlrange.T
-    limited = model.actuator_ctrllimited.astype(bool)
-    return np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
+    is_limited = model.actuator_ctrllimited.astype(bool)
+    return np.where(is_limited, low, -np.inf), np.where(is_limited, high, np.inf)

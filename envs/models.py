@@ -144,15 +144,15 @@ def replaced(model: Any, episode: dict[str, Any]) -> dict[str, Any]:
       model: an ``MjModel`` or an ``mjx.Model``.
       episode: what ``MujocoEnv.randomize`` returned.
     """
-    fields = {name: value for name, value in episode.items() if name in RANDOM}
-    if "body_mass" in fields:
+    model_fields = {name: value for name, value in episode.items() if name in RANDOM}
+    if "body_mass" in model_fields:
         in_subtree = np.eye(model.nbody)  # [i, j]: whether body j is in the subtree of body i
         # From the leaves to the root: a parent's number is below those of its children.
         for body in range(model.nbody - 1, 0, -1):
             in_subtree[model.body_parentid[body]] += in_subtree[body]
-        mass = fields["body_mass"]
-        fields["body_subtreemass"] = in_subtree.astype(mass.dtype) @ mass
-    return fields
+        mass = model_fields["body_mass"]
+        model_fields["body_subtreemass"] = in_subtree.astype(mass.dtype) @ mass
+    return model_fields
 
 
 def make_data(model: "mjx.Model") -> mjx.Data:
@@ -176,12 +176,12 @@ def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
     try:
         # Not on JAX's first device, which may be another process's.
         device = jax.local_devices()[0]
-        converted = mjx.put_model(_without_idle_pairs(model), impl="jax", device=device)
+        mjx_model = mjx.put_model(_without_idle_pairs(model), impl="jax", device=device)
         # Notices what the model alone does not show; its arrays are not made.
         jax.eval_shape(lambda: make_data(model))
     except Exception as error:  # of another library: no refusal
         raise BadEnvironmentError(f"converting {name} to MJX fails: {explain(error)}") from error
-    return converted
+    return mjx_model
 
 
 def _without_idle_pairs(model: MjModel) -> MjModel:

@@ -31,8 +31,8 @@ def check_start(name: str, start: object, sizes: tuple[int, int]) -> tuple[Any, 
     pair = start if isinstance(start, tuple | list) else ()
     require(len(pair) == 2, f"{name}.initial must return qpos and qvel, got {in_words(start)}")
     for field, value, size in zip(("qpos", "qvel"), pair, sizes, strict=True):
-        rule = f"{name}.initial must return {field} [{size}], as the model has it"
-        require(shape_of(value) == (size,), f"{rule}, got {in_words(value)}")
+        requirement = f"{name}.initial must return {field} [{size}], as the model has it"
+        require(shape_of(value) == (size,), f"{requirement}, got {in_words(value)}")
     qpos, qvel = (jnp.asarray(x, jnp.result_type(x, float)) for x in pair)  # also of integers
     return qpos, qvel
 
@@ -48,9 +48,9 @@ def check_episode(name: str, episode: object, model: MjModel) -> dict[str, jax.A
     Raises:
       ValueError: it is something else, or replaces what cannot be replaced.
     """
-    named = isinstance(episode, dict) and all(isinstance(key, str) for key in episode)
-    rule = f"{name}.randomize must return a dict of quantities by their names"
-    require(named, f"{rule}, got {in_words(episode)}")
+    is_named = isinstance(episode, dict) and all(isinstance(key, str) for key in episode)
+    requirement = f"{name}.randomize must return a dict of quantities by their names"
+    require(is_named, f"{requirement}, got {in_words(episode)}")
     arrays: dict[str, jax.Array] = {}
     for key, value in dict(cast(Any, episode)).items():
         quantity = f"{key!r} of {name}.randomize"
@@ -89,16 +89,16 @@ def check_centers(
     # The check is made while ``draw`` is traced, but it needs numbers.
     with jax.ensure_compile_time_eval():
         keys = jax.random.split(jax.random.key(0), _DRAWS)
-        drawn = np.asarray(jax.vmap(lambda key: jnp.asarray(randomize(key)["body_ipos"]))(keys))
-    moved = np.any(drawn != np.asarray(center), axis=(0, 2))
+        draws = np.asarray(jax.vmap(lambda key: jnp.asarray(randomize(key)["body_ipos"]))(keys))
+    has_moved = np.any(draws != np.asarray(center), axis=(0, 2))
     # body_simple is 1 where MuJoCo takes the body's block of the inertia matrix to be diagonal. The
     # block of one degree of freedom is a single number, which has its place.
-    fixed = np.flatnonzero(moved & (model.body_simple == 1) & (model.body_dofnum > 1))
-    if fixed.size:
-        names = ", ".join(model.body(int(body)).name or f"number {body}" for body in fixed)
+    fixed_bodies = np.flatnonzero(has_moved & (model.body_simple == 1) & (model.body_dofnum > 1))
+    if fixed_bodies.size:
+        bodies = ", ".join(model.body(int(body)).name or f"number {body}" for body in fixed_bodies)
         raise UnsupportedError(
             f"body_ipos of {name}.randomize moves the center of mass of a body at whose origin "
-            f'MuJoCo took it to be ({names}); write <body simple="false"> in the model'
+            f'MuJoCo took it to be ({bodies}); write <body simple="false"> in the model'
         )
 
 
@@ -119,14 +119,14 @@ def check_outcome(name: str, outcome: object) -> tuple[Any, Any, dict[str, Any]]
         f"a dict of the reward's terms, got {in_words(outcome)}",
     )
     reward, terminated, terms = triple
-    rule = f"the third value of {name}.outcome must be a dict of the reward's terms"
-    require(isinstance(terms, dict), f"{rule}, got {in_words(terms)}")
+    requirement = f"the third value of {name}.outcome must be a dict of the reward's terms"
+    require(isinstance(terms, dict), f"{requirement}, got {in_words(terms)}")
     # A reward [1] would broadcast in silence, and give all that follows an axis more.
     scalars = {f"term {key!r}": value for key, value in terms.items()}
     for quantity, value in {"reward": reward, "termination": terminated, **scalars}.items():
-        rule = f"the {quantity} of {name}.outcome must be a scalar []"
+        requirement = f"the {quantity} of {name}.outcome must be a scalar []"
         require(
             shape_of(value) == (),
-            f"{rule}, got {in_words(value)}; sum it, or take an entry",
+            f"{requirement}, got {in_words(value)}; sum it, or take an entry",
         )
     return reward, terminated, terms

@@ -21,7 +21,7 @@ _KINDS = {
     "sensor": ("nsensor", "sensor"),
 }
 #: Fields of mjData with a row for each joint; others that a joint has are those of its dofs.
-_OF_JOINTS = ("xanchor", "xaxis")
+_JOINT_FIELDS = ("xanchor", "xaxis")
 
 
 class Part:
@@ -30,18 +30,18 @@ class Part:
     def __init__(self, data: Any, model: MjModel, kind: str, name: str):
         """Finds the part; raises ValueError for a name that the model has not."""
         size, self._prefix = _KINDS[kind]
-        names = [getattr(model, kind)(i).name for i in range(getattr(model, size))]
+        part_names = [getattr(model, kind)(i).name for i in range(getattr(model, size))]
         # A message lists the names that there are; parts without one have an empty name.
-        check_name(kind, name, dict.fromkeys(filter(None, names)))
+        check_name(kind, name, dict.fromkeys(filter(None, part_names)))
         self._data = data
         self._model = model
         self._kind = kind
-        self.id = names.index(name)
+        self.id = part_names.index(name)
 
     def __getattr__(self, field: str) -> jax.Array:
         """Returns the part's rows of a field: one, or of a joint or sensor as many as it has."""
         # One row of xanchor or xaxis, but several of qpos, or of a field of the degrees of freedom.
-        if self._kind == "joint" and field not in _OF_JOINTS:
+        if self._kind == "joint" and field not in _JOINT_FIELDS:
             return getattr(self._data, field)[self._rows(field)]
         # The controls are the only field of actuators without a prefix.
         full_name = "ctrl" if field == "ctrl" else f"{self._prefix}{field}"

@@ -27,14 +27,14 @@ NOT_CARRIED = {
     "plugin": ("nplugin", "plugins", "remove them"),
     "plastic": ("nplastic", "plastic springs", "remove springyield"),
 }
-_ON_JOINT = "give it to the joint, times the square of gear"
+_JOINT_REMEDY = "give it to the joint, times the square of gear"
 _ONE_NUMBER = "give one number"
-_GO_ON = 'set <option iterations="100" ls_iterations="50"/>, or solver="Newton" cone="pyramidal"'
+_SOLVER = 'set <option iterations="100" ls_iterations="50"/>, or solver="Newton" cone="pyramidal"'
 #: What else MJX ignores in silence.
 _IGNORED = (
-    ("actuator_armature", "the armature of an actuator", _ON_JOINT),
-    ("actuator_damping", "the damping of an actuator", _ON_JOINT),
-    ("actuator_dampingpoly", "the polynomial damping of an actuator", _ON_JOINT),
+    ("actuator_armature", "the armature of an actuator", _JOINT_REMEDY),
+    ("actuator_damping", "the damping of an actuator", _JOINT_REMEDY),
+    ("actuator_dampingpoly", "the polynomial damping of an actuator", _JOINT_REMEDY),
     ("actuator_actearly", "actearly of an actuator", 'remove actearly="true"'),
     ("jnt_stiffnesspoly", "the polynomial stiffness of a joint", _ONE_NUMBER),
     ("dof_dampingpoly", "the polynomial damping of a joint", _ONE_NUMBER),
@@ -75,11 +75,11 @@ _REMEDIES = {
     "own",
     "mjENBL_": "take that <flag> out of <option>",
 }
-_ELSE = "remove it; MuJoCo's documentation lists what MJX supports under 'MJX, feature parity'"
+_REMOVAL = "remove it; MuJoCo's documentation lists what MJX supports under 'MJX, feature parity'"
 #: Fields of a model that say how stiff its constraints are.
-_STIFF = ("dof_{}", "eq_{}", "geom_{}", "jnt_{}", "pair_{}", "tendon_{}_lim", "tendon_{}_fri")
+_SOLREF = ("dof_{}", "eq_{}", "geom_{}", "jnt_{}", "pair_{}", "tendon_{}_lim", "tendon_{}_fri")
 #: A message names so many geoms, or pairs of them.
-_NAMED = 3
+_MAX_NAMED = 3
 
 
 class UnsupportedError(BadEnvironmentError):
@@ -139,17 +139,17 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
             yield feature, remedy
     # Joints and tendons with a lower and an upper limit; a ball's limit is one angle. MJX has one
     # row for both limits, C a row for each that is nearer than the margin.
-    scalar = model.jnt_type != _C.mjtJoint.mjJNT_BALL
+    is_scalar = model.jnt_type != _C.mjtJoint.mjJNT_BALL
     for kind, limited, ends, margin in (
-        ("joint", model.jnt_limited & scalar, model.jnt_range, model.jnt_margin),
+        ("joint", model.jnt_limited & is_scalar, model.jnt_range, model.jnt_margin),
         ("tendon", model.tendon_limited, model.tendon_range, model.tendon_margin),
     ):
-        narrow = np.flatnonzero(limited & (np.ptp(ends, axis=1) < 2 * margin))
-        if narrow.size:
-            names = _listed([getattr(model, kind)(i).name or f"number {i}" for i in narrow])
+        narrow_ranges = np.flatnonzero(limited & (np.ptp(ends, axis=1) < 2 * margin))
+        if narrow_ranges.size:
+            names = _listed([getattr(model, kind)(i).name or f"number {i}" for i in narrow_ranges])
             remedy = "give it a margin of at most half of its range"
             yield f"one of two limits that a {kind} meets at once ({names})", remedy
-    refs = (getattr(model, of.format("solref")) for of in _STIFF)
+    refs = (getattr(model, field_format.format("solref")) for field_format in _SOLREF)
     if any(np.any((ref[:, 0] > 0) != (ref[:, 1] > 0)) for ref in refs):
         remedy = "give two positive numbers, or two that are not"
         yield "MuJoCo's default in place of a solref of mixed signs", remedy
@@ -160,9 +160,9 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
     if stops_early(model):
         early_stop = f"where C stops after so few iterations ({model.opt.iterations}), with "
         if model.opt.solver == _C.mjtSolver.mjSOL_CG:
-            yield early_stop + "conjugate gradients", _GO_ON
+            yield early_stop + "conjugate gradients", _SOLVER
         if model.opt.cone == _C.mjtCone.mjCONE_ELLIPTIC and any(geom_pairs(model)):
-            yield early_stop + "elliptic cones", _GO_ON
+            yield early_stop + "elliptic cones", _SOLVER
     if model.opt.disableactuator:
         yield "disabled groups of actuators", "remove actuatorgroupdisable, or those actuators"
     for flag, values in (("spring", "stiffness"), ("damper", "damping")):
@@ -184,7 +184,7 @@ def _missing(model: MjModel) -> Iterator[tuple[str, str]]:
     for values, in_mjx, in_c in (*enums, (flags, mjx.EnableBit, _ENABLED)):
         for kind in sorted({*map(int, values)} - {*map(int, in_mjx)}):
             name = in_c(kind).name
-            remedy = next((x for part, x in _REMEDIES.items() if part in name), _ELSE)
+            remedy = next((x for part, x in _REMEDIES.items() if part in name), _REMOVAL)
             # MJX would ignore the discrete integrator, which _ignored says.
             if name != "mjINT_DISCRETE":
                 yield f"MJX has no {name}", remedy
@@ -201,10 +201,10 @@ def _missing(model: MjModel) -> Iterator[tuple[str, str]]:
         yield "its rangefinders work only with a material, a bug of MJX", remedy
     # [2, n]: what each of the contact sensors looks at, on both sides. The second of its integers
     # says how contacts are reduced: 3 is reduce="netforce".
-    of_contacts = model.sensor_type == _C.mjtSensor.mjSENS_CONTACT
-    sides = np.stack([model.sensor_objtype, model.sensor_reftype])[:, of_contacts]
-    wide = np.isin(sides, (_C.mjtObj.mjOBJ_SITE, _C.mjtObj.mjOBJ_BODY, _C.mjtObj.mjOBJ_XBODY))
-    if wide.any() or np.any(model.sensor_intprm[of_contacts, 1] == 3):
+    is_contact = model.sensor_type == _C.mjtSensor.mjSENS_CONTACT
+    sides = np.stack([model.sensor_objtype, model.sensor_reftype])[:, is_contact]
+    is_wide = np.isin(sides, (_C.mjtObj.mjOBJ_SITE, _C.mjtObj.mjOBJ_BODY, _C.mjtObj.mjOBJ_XBODY))
+    if is_wide.any() or np.any(model.sensor_intprm[is_contact, 1] == 3):
         remedy = "name two geoms, and do not reduce to the net force"
         yield "MJX has contact sensors between geoms alone, without net force", remedy
 
@@ -276,8 +276,8 @@ def geom_name(model: MjModel, geom: int) -> str:
 
 def _listed(names: Sequence[str]) -> str:
     """Returns the first names, and how many more there are."""
-    text = ", ".join(names[:_NAMED])
-    num_unnamed = len(names) - _NAMED
+    text = ", ".join(names[:_MAX_NAMED])
+    num_unnamed = len(names) - _MAX_NAMED
     if num_unnamed > 0:
         text += f", and {num_unnamed:,} more"
     return text

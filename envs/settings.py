@@ -48,18 +48,20 @@ def build_settings(env: Any, arguments: dict[str, Any]) -> Any:
       ValueError: an argument is unknown or missing, or its value is not of its type or range.
     """
     task = type(env).__name__
-    fields = {field.name: field for field in dataclasses.fields(env.Settings) if field.init}
+    init_fields = {field.name: field for field in dataclasses.fields(env.Settings) if field.init}
     for name in arguments:
-        checks.check_name(f"argument of {task}", name, fields)
+        checks.check_name(f"argument of {task}", name, init_fields)
     no_default = dataclasses.MISSING
     # Before the dataclass complains, which would name its constructor and not the task.
-    required = [x.name for x in fields.values() if x.default is x.default_factory is no_default]
+    required = [
+        x.name for x in init_fields.values() if x.default is x.default_factory is no_default
+    ]
     missing = [name for name in required if name not in arguments]
     if missing:
         raise ValueError(
             f"{task} needs {', '.join(missing)}: pass them, or give them defaults in its Settings"
         )
-    for name, field in fields.items():
+    for name, field in init_fields.items():
         value = arguments.get(name, field.default)
         # Defaults are checked as well: a task of the user's own may have one of another type.
         if value is not no_default:
@@ -75,7 +77,7 @@ def split_words(words: Sequence[str]) -> dict[str, str]:
     Raises:
       ValueError: a word is of another form, or a name stands twice.
     """
-    texts: dict[str, str] = {}
+    value_texts: dict[str, str] = {}
     for word in words:
         # Names as flags have them, too: --env-set frame-skip=2.
         name, equals, text = word.partition("=")
@@ -84,10 +86,10 @@ def split_words(words: Sequence[str]) -> dict[str, str]:
             raise ValueError(
                 f"--env-set takes NAME=VALUE, such as ctrl_cost_weight=0.1, got {word!r}"
             )
-        if name in texts:
-            raise ValueError(f"--env-set has {name} twice: {texts[name]} and {text}")
-        texts[name] = text
-    return texts
+        if name in value_texts:
+            raise ValueError(f"--env-set has {name} twice: {value_texts[name]} and {text}")
+        value_texts[name] = text
+    return value_texts
 
 
 def read_settings(task: object, words: Sequence[str]) -> dict[str, Any]:
@@ -101,7 +103,7 @@ def read_settings(task: object, words: Sequence[str]) -> dict[str, Any]:
     Raises:
       ValueError: a name is unknown, or a text is not of its type.
     """
-    texts = split_words(words)
+    value_texts = split_words(words)
     task_name = getattr(task, "__name__", str(task))
     schema = getattr(task, "Settings", None)
     if not dataclasses.is_dataclass(schema):
@@ -112,10 +114,10 @@ def read_settings(task: object, words: Sequence[str]) -> dict[str, Any]:
     # Resolved: under ``from __future__ import annotations`` a field's type is text.
     kinds = typing.get_type_hints(schema)
     types = {field.name: kinds[field.name] for field in dataclasses.fields(schema) if field.init}
-    for name in texts:
+    for name in value_texts:
         checks.check_name(f"setting of {task_name}", name, types)
     arguments = {}
-    for name, text in texts.items():
+    for name, text in value_texts.items():
         try:
             arguments[name] = checks.read_as(types[name], text)
         except (ValueError, TypeError):

@@ -20,9 +20,9 @@ from mjx_reinforce.engine.checks import explain
 from mjx_reinforce.engine.memory import gigabytes
 
 #: What arrays may take that are read from an archive (bytes).
-_UNPACKED = 2**26
+_MAX_BYTES = 2**26
 #: Or, of a large archive, how often its own size.
-_TIMES = 32
+_MAX_RATIO = 32
 #: Named arrays, as an archive (.npz) holds them.
 Arrays = dict[str, np.ndarray]
 
@@ -30,17 +30,17 @@ Arrays = dict[str, np.ndarray]
 def write_bytes(path: Path, content: bytes) -> None:
     """Replaces a file at once: a reader, a crash or a power cut sees the old one or the new one."""
     # In the same folder: a file system replaces at once only what is its own.
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    temporary_path = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
-        with temporary.open("xb") as file:
+        with temporary_path.open("xb") as file:
             file.write(content)
             # Else a power cut could leave the new name with nothing in it.
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, path)
+        os.replace(temporary_path, path)
     except BaseException:
         with contextlib.suppress(FileNotFoundError):
-            temporary.unlink()
+            temporary_path.unlink()
         raise
     with contextlib.suppress(OSError):  # not every file system can; the file is whole without it
         _sync(path.parent)
@@ -50,8 +50,8 @@ def remove_leftovers(*folders: Path) -> None:
     """Removes what a crash left of ``write_bytes`` in folders, which need not exist."""
     for folder in folders:
         # Eight hexadecimal digits, as ``write_bytes`` ends the name of a temporary file.
-        for leftover in folder.glob(".*." + 8 * "[0-9a-f]"):
-            leftover.unlink()
+        for temporary_path in folder.glob(".*." + 8 * "[0-9a-f]"):
+            temporary_path.unlink()
 
 
 def check_folder(folder: Path) -> None:
@@ -59,8 +59,10 @@ def check_folder(folder: Path) -> None:
     try:
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        missing = "" if folder.exists() else ", which does not exist"
-        raise ValueError(f"cannot write to {folder}{missing}; choose another --output") from error
+        folder_note = "" if folder.exists() else ", which does not exist"
+        raise ValueError(
+            f"cannot write to {folder}{folder_note}; choose another --output"
+        ) from error
 
 
 class MovedError(FileNotFoundError):
@@ -120,11 +122,11 @@ def check_module(path: Path, example: str) -> None:
 
 def _sync(folder: Path) -> None:
     """Waits until the names in a folder are on the disk."""
-    handle = os.open(folder, os.O_RDONLY)
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
-        os.fsync(handle)
+        os.fsync(descriptor)
     finally:
-        os.close(handle)
+        os.close(descriptor)
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
@@ -165,10 +167,10 @@ def naming_damage(path: Path) -> Iterator[None]:
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False) -> None:
     """Writes a NumPy archive (.npz) of named arrays; no pickle."""
-    content = io.BytesIO()
+    buffer = io.BytesIO()
     save = np.savez_compressed if compressed else np.savez
-    save(content, allow_pickle=False, **arrays)
-    write_bytes(path, content.getvalue())
+    save(buffer, allow_pickle=False, **arrays)
+    write_bytes(path, buffer.getvalue())
 
 
 def read_arrays(
@@ -190,16 +192,16 @@ def read_arrays(
             check_archive(file, names, stored=stored)
             file.seek(0)
             with np.load(file, allow_pickle=False) as archive:
-                present = archive.files if names is None else [x for x in names if x in archive]
-                arrays = {name: np.asarray(archive[name]) for name in present}
+                array_names = archive.files if names is None else [x for x in names if x in archive]
+                arrays = {name: np.asarray(archive[name]) for name in array_names}
     except OSError as error:
         raise ValueError(f"cannot read {path} ({error.strerror})") from error
     except Exception as error:  # what zip and NumPy raise has no common class
         # NumPy's second sentence proposes to trust a pickle.
         reason = f"{type(error).__name__}: {error}".splitlines()[0].partition(". ")[0]
         raise ValueError(f"{path} is damaged: not a whole NumPy archive ({reason})") from error
-    if missing := [name for name in names or () if name not in arrays]:
-        raise ValueError(f"{path} is damaged: {missing[0]} is missing")
+    if missing_names := [name for name in names or () if name not in arrays]:
+        raise ValueError(f"{path} is damaged: {missing_names[0]} is missing")
     return arrays
 
 
@@ -224,7 +226,7 @@ def check_archive(
     if names is not None:
         members = [x for x in members if x.filename.removesuffix(".npy") in names]
     total = sum(member.file_size for member in members)
-    if total > max(_UNPACKED, _TIMES * size):
+    if total > max(_MAX_BYTES, _MAX_RATIO * size):
         raise ValueError(
             f"its arrays take {gigabytes(total)}, too many times the {gigabytes(size)} of the file"
         )
@@ -257,14 +259,14 @@ def append(path: Path, content: bytes) -> None:
     Raises:
       OSError: it cannot be written, or it is not there, and with it what it held before.
     """
-    unwritten = memoryview(content)
+    remaining_bytes = memoryview(content)
     # Unbuffered: a buffer would be written when the file is closed, behind the cut below. Such a
     # write may take a part of the bytes only.
     with path.open("r+b", buffering=0) as file:
         size = file.seek(0, os.SEEK_END)
         try:
-            while unwritten:
-                unwritten = unwritten[file.write(unwritten) :]
+            while remaining_bytes:
+                remaining_bytes = remaining_bytes[file.write(remaining_bytes) :]
         except BaseException:
             file.truncate(size)
             raise

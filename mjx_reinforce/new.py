@@ -107,14 +107,20 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
     # Five seconds are an episode.
     num_steps = round(5 / (frame_skip * timestep)) or 1
     # What a robot without a home or without a free joint needs in these places.
-    fields: dict[str, Any] = {"home": "", "imports": "", "effort": "action", "body": 0, "up": ""}
+    placeholders: dict[str, Any] = {
+        "home": "",
+        "imports": "",
+        "effort": "action",
+        "body": 0,
+        "up": "",
+    }
     if has_home:
-        fields["home"] = _HOME
-        fields["imports"] = "from mjx_reinforce import Box\n"
-        fields["effort"] = "(action - self.home)"
+        placeholders["home"] = _HOME
+        placeholders["imports"] = "from mjx_reinforce import Box\n"
+        placeholders["effort"] = "(action - self.home)"
     if is_free:
-        fields["body"] = int(model.jnt_bodyid[0])
-        fields["up"] = _up(model)
+        placeholders["body"] = int(model.jnt_bodyid[0])
+        placeholders["up"] = _up(model)
     return template.format(
         title=_title(module),
         module=module,
@@ -126,7 +132,7 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
         pose="self.mj_model.key_qpos[0]" if model.nkey else "self.mj_model.qpos0",
         observed="".join(f"                data.{entry},\n" for entry in observation),
         about="\n".join(_about(model)),
-        **fields,
+        **placeholders,
     )
 
 

@@ -65,12 +65,16 @@ def simulator(env: "Environment", player: Player, horizon: int) -> Simulator:
 
         def advance(carry, noise):
             """Plays a step; behind the episode's end the state stays as it was."""
-            state, alive = carry
-            played = play_step(actor, state, noise, alive, deterministic)
-            after = hold(alive, played.state, state)
+            state, is_alive = carry
+            played_step = play_step(actor, state, noise, is_alive, deterministic)
+            next_state = hold(is_alive, played_step.state, state)
             # A step out of the finite numbers ends the episode, and its reward is none.
-            reward = jnp.where(played.broken, jnp.nan, played.reward)
-            return (after, played.alive), (after.pipeline_state.qpos, reward, alive)
+            reward = jnp.where(played_step.broken, jnp.nan, played_step.reward)
+            return (next_state, played_step.alive), (
+                next_state.pipeline_state.qpos,
+                reward,
+                is_alive,
+            )
 
         start, noise_key = begin(env, jax.random.fold_in(key, episode))
         noises = distribution.noise(noise_key, (horizon,))
@@ -110,12 +114,14 @@ def mujoco_simulator(env: "Environment", player: Player, horizon: int) -> Simula
         """Plays the episode of a number, from the start that it has in our simulation, too."""
         rng = np.random.default_rng(episode) if noise else None
         observation = simulation.reset(_start_key(episode))
-        ended = False
+        has_ended = False
         # Copies: MuJoCo writes every step into the same array.
         qpos = [simulation.data.qpos.copy()]
         rewards = []
-        while not ended and len(rewards) < horizon:
-            observation, reward, ended = simulation.step(np.asarray(player.act(observation, rng)))
+        while not has_ended and len(rewards) < horizon:
+            observation, reward, has_ended = simulation.step(
+                np.asarray(player.act(observation, rng))
+            )
             if not (np.isfinite(observation).all() and np.isfinite(reward)):
                 rewards.append(np.nan)
                 break

@@ -22,7 +22,7 @@ from mjx_reinforce.reports.findings import Findings, compute_findings, swept, wo
 from mjx_reinforce.settings.config import code_flags
 from mjx_reinforce.settings.flags import run_command
 from mjx_reinforce.setup.provenance import version
-from mjx_reinforce.training.resume import BEGUN
+from mjx_reinforce.training.resume import FIRST_FILES
 
 #: How the names of pages end.
 _PAGES = (".html", ".htm")
@@ -90,11 +90,11 @@ def _default_output(chosen: Sequence[Path]) -> Path:
 def check_page(output: Path, overwrite: bool) -> None:
     """Raises ValueError if the report cannot be written there, or would replace files unasked."""
     check_output(output, overwrite, *_PAGES)
-    beside = _beside(output)
-    if beside.exists() and not beside.is_dir():
-        raise ValueError(f"{beside} is in the way of the pictures; choose another --output")
-    if beside.is_dir() and any(beside.iterdir()) and not overwrite:
-        raise ValueError(f"{beside} exists; pass --overwrite or another --output")
+    folder = _beside(output)
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder} is in the way of the pictures; choose another --output")
+    if folder.is_dir() and any(folder.iterdir()) and not overwrite:
+        raise ValueError(f"{folder} exists; pass --overwrite or another --output")
 
 
 class WrittenReport(NamedTuple):
@@ -132,15 +132,15 @@ def _write(experiment: Experiment, output: Path) -> WrittenReport:
     findings = compute_findings(experiment)
     charts = document.draw_charts(findings)
     labels = findings.labels
-    beside = _beside(output)
-    beside.mkdir(exist_ok=True)
+    folder = _beside(output)
+    folder.mkdir(exist_ok=True)
     results = results_csv(findings)
-    write_bytes(beside / "results.csv", encoded(results))
+    write_bytes(folder / "results.csv", encoded(results))
     for chart in charts:
         for name, table in chart.data.items():
-            write_bytes(beside / f"{name}.csv", encoded(table_csv(table, labels)))
+            write_bytes(folder / f"{name}.csv", encoded(table_csv(table, labels)))
         for ending, picture in render_chart(chart, labels, experiment.title).items():
-            write_bytes(beside / f"{chart.name}.{ending}", picture)
+            write_bytes(folder / f"{chart.name}.{ending}", picture)
     # The page is last, so that all that it links to is there; its own time it cannot say.
     seconds = time.perf_counter() - start
     watch = how_to_watch(experiment, findings)
@@ -152,17 +152,17 @@ def _write(experiment: Experiment, output: Path) -> WrittenReport:
 
 def _beside(output: Path) -> Path:
     """Returns the folder for a page's pictures and tables, which is none that has runs."""
-    beside = output.with_suffix("")
-    while any(path for name in BEGUN for path in beside.rglob(name)):
-        beside = beside.with_name(f"{beside.name}-report")
-    return beside
+    folder = output.with_suffix("")
+    while any(path for name in FIRST_FILES for path in folder.rglob(name)):
+        folder = folder.with_name(f"{folder.name}-report")
+    return folder
 
 
 def _is_report(path: Path) -> bool:
     """Returns whether a path is a page, or the folder of its pictures and tables."""
     page = path.suffix.lower() in _PAGES and path.is_file()
     return page or (
-        (path / "results.csv").is_file() and not any((path / x).exists() for x in BEGUN)
+        (path / "results.csv").is_file() and not any((path / x).exists() for x in FIRST_FILES)
     )
 
 
@@ -178,14 +178,14 @@ def results_csv(findings: Findings) -> str:
         settings = [say(configuration.settings.get(name)) for name in names]
         # A seed's evaluations that were not finite are passed over.
         best = short(np.fmax.reduce(configuration.eval_return, axis=0), 7)
-        final = short(result.final, 7)
+        final_returns = short(result.final, 7)
         env_steps = configuration.env_steps[-1].tolist()
         for s, seed in enumerate(configuration.seed.tolist()):
             # Empty for a seed that never solved the task, and where nothing counts as solved.
             solved = int(solving.steps[s]) if solving and solving.solved[s] else ""
             nonfinite = int(configuration.nonfinite[s])
-            values = (seed, final[s], best[s], solved, env_steps[s], nonfinite)
-            lines.append((number, *settings, *values))
+            cells = (seed, final_returns[s], best[s], solved, env_steps[s], nonfinite)
+            lines.append((number, *settings, *cells))
     return csv_text(lines)
 
 
@@ -197,20 +197,20 @@ def table_csv(table: Table, labels: Sequence[str]) -> str:
 def how_to_watch(experiment: Experiment, findings: Findings) -> str:
     """Returns the command that shows the best configuration's worst seed, "" if none was kept."""
     best = findings.results[0]
-    worst = worst_seeds(best)[0]
-    seed = int(best.configuration.seed[worst])
-    place = best.configuration.directories[worst]
+    worst_seed = worst_seeds(best)[0]
+    seed = int(best.configuration.seed[worst_seed])
+    policy_folder = best.configuration.directories[worst_seed]
     # The directory of a sweep has no config.json, and a folder of policies for each configuration,
     # counted within the sweep: it may be one of several sources.
-    if not (place / "config.json").is_file():
+    if not (policy_folder / "config.json").is_file():
         sweep = experiment.directories[findings.order[0]]
         number = findings.order[0] - experiment.directories.index(sweep)
-        place = place / "policies" / f"{number:03d}"
+        policy_folder = policy_folder / "policies" / f"{number:03d}"
         # A sweep keeps the policies of each configuration's worst and best seed alone.
-        if seed not in seeds_in(place):
+        if seed not in seeds_in(policy_folder):
             return ""
     flags = code_flags({"env": experiment.env})
-    return f"python -m mjx_reinforce.watch {shlex.quote(str(place))} --seed {seed}{flags}"
+    return f"python -m mjx_reinforce.watch {shlex.quote(str(policy_folder))} --seed {seed}{flags}"
 
 
 if __name__ == "__main__":

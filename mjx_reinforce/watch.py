@@ -147,9 +147,9 @@ def film_path(settings: WatchSettings, run: Run) -> Path:
     """
     if not 0 < settings.seconds < float("inf"):
         raise ValueError(f"--seconds must be positive and finite, got {settings.seconds}")
-    for name, (least, most) in _RANGES.items():
-        if not least <= (value := getattr(settings, name)) <= most:
-            raise ValueError(f"--{name} must be in [{least}, {most}], got {value}")
+    for name, (minimum, maximum) in _RANGES.items():
+        if not minimum <= (value := getattr(settings, name)) <= maximum:
+            raise ValueError(f"--{name} must be in [{minimum}, {maximum}], got {value}")
     seed = choose_seed(run, settings.seed, settings.which)
     by_default = Path(f"{run.env}.gif") if run.packaged else run.directory / f"seed-{seed}.gif"
     output = settings.output or by_default

@@ -14,7 +14,7 @@ _VELOCITY_NOISE = 0.005
 # goal at the origin.
 _DEPTH = 0.3
 _HALF_WIDTH = 0.2
-_CLEAR = 0.17
+_CLEARANCE = 0.17
 
 
 class Reacher(MujocoEnv):
@@ -64,9 +64,9 @@ class Reacher(MujocoEnv):
         """Returns the observation [10]."""
         # qpos[2:] is the target's position: it moves on two joints, which no motor drives.
         angles = data.qpos[:2]
-        away = self._away(data)[:2]
+        target_offset = self._away(data)[:2]
         return jnp.concatenate(
-            [jnp.cos(angles), jnp.sin(angles), data.qpos[2:], data.qvel[:2], away]
+            [jnp.cos(angles), jnp.sin(angles), data.qpos[2:], data.qvel[:2], target_offset]
         )
 
     def outcome(self, before, data, action):
@@ -142,13 +142,13 @@ class Pusher(MujocoEnv):
         """Returns the penalties for distances and control; never terminates."""
         # All at the last forward pass, as in Gymnasium, not at the new qpos.
         cylinder = data.body("object").xpos
-        near = cylinder - data.body("tips_arm").xpos
+        tip_offset = cylinder - data.body("tips_arm").xpos
         dist = cylinder - data.body("goal").xpos
         weights = self.settings
         terms = {
             "reward_dist": -weights.reward_dist_weight * jnp.linalg.norm(dist),
             "reward_ctrl": -weights.reward_control_weight * jnp.sum(action**2),
-            "reward_near": -weights.reward_near_weight * jnp.linalg.norm(near),
+            "reward_near": -weights.reward_near_weight * jnp.linalg.norm(tip_offset),
         }
         return sum(terms.values()), jnp.zeros((), bool), terms
 
@@ -166,12 +166,12 @@ def _cylinder(key):
 
     def edge(depth):
         """Returns half the width of the disc at a depth."""
-        return jnp.sqrt(jnp.maximum(_CLEAR**2 - depth**2, 0))
+        return jnp.sqrt(jnp.maximum(_CLEARANCE**2 - depth**2, 0))
 
     def area(depth):
         # Half of it, to one side: the rectangle nearer than ``depth`` less its part of the disc.
-        disc_depth = jnp.minimum(depth, _CLEAR)
-        disc = _CLEAR**2 * jnp.arcsin(disc_depth / _CLEAR) + disc_depth * edge(disc_depth)
+        disc_depth = jnp.minimum(depth, _CLEARANCE)
+        disc = _CLEARANCE**2 * jnp.arcsin(disc_depth / _CLEARANCE) + disc_depth * edge(disc_depth)
         return _HALF_WIDTH * depth - disc / 2
 
     # The derivative of the area is how wide the free strip is at that depth.
@@ -179,6 +179,7 @@ def _cylinder(key):
     depth = jnp.full_like(side, _DEPTH)
     for _ in range(12):
         depth = depth - (area(depth) - target_area) / (_HALF_WIDTH - edge(depth))
-    # Across, beyond the disc on either side.
-    across = edge(depth) + jnp.abs(side) * (_HALF_WIDTH - edge(depth))
-    return jnp.stack([-depth, jnp.copysign(across, side)])
+    # Uniform in the free strip beside the disc (m); the sign of ``side`` picks the left or right
+    # one.
+    lateral_distance = edge(depth) + jnp.abs(side) * (_HALF_WIDTH - edge(depth))
+    return jnp.stack([-depth, jnp.copysign(lateral_distance, side)])

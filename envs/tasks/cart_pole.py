@@ -111,9 +111,9 @@ class Cart(Env):
         qvel = motion.qvel + _TIMESTEP * qacc
         # Explicit Euler, as in Gymnasium: positions move by the old velocities.
         qpos = motion.qpos + _TIMESTEP * motion.qvel
-        lost = jnp.any(jnp.abs(qpos) > jnp.array([_MAX_POSITION, self.max_angle], qpos.dtype))
-        reward = jnp.where(lost, reward_lost, reward_up).astype(qpos.dtype)
-        return _state(qpos, qvel, reward, lost.astype(qpos.dtype), state)
+        is_lost = jnp.any(jnp.abs(qpos) > jnp.array([_MAX_POSITION, self.max_angle], qpos.dtype))
+        reward = jnp.where(is_lost, reward_lost, reward_up).astype(qpos.dtype)
+        return _state(qpos, qvel, reward, is_lost.astype(qpos.dtype), state)
 
 
 class CartPole(Cart):
@@ -202,8 +202,8 @@ def _acceleration(motion: Motion, force: jax.Array | float) -> jax.Array:
 
 def _state(qpos, qvel, reward, terminated, previous: State | None = None) -> State:
     """Returns a state; all else is as in the previous one, such as what wrappers keep there."""
-    # Gymnasium's order is position and velocity of the cart, then of the pole.
     motion = cast(Any, Motion(qpos=qpos, qvel=qvel))
+    # Gymnasium's order is position and velocity of the cart, then of the pole.
     obs = jnp.stack([qpos[0], qvel[0], qpos[1], qvel[1]])
     if previous is None:
         return State(motion, obs, reward, terminated)

@@ -53,7 +53,7 @@ class Person(Body):
             (settings.include_qfrc_actuator_in_observation, data.qfrc_actuator[6:]),
             (settings.include_cfrc_ext_in_observation, data.cfrc_ext[1:]),
         ]
-        return jnp.concatenate([part.ravel() for included, part in parts if included])
+        return jnp.concatenate([part.ravel() for is_included, part in parts if is_included])
 
 
 class Humanoid(Person, Healthy):

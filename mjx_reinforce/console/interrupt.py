@@ -37,10 +37,10 @@ class Interrupt:
         self._receiver, self._sender = socket.socketpair()
         self._sender.setblocking(False)
         self._descriptor = signal.set_wakeup_fd(self._sender.fileno(), warn_on_full_buffer=False)
-        numbers = [signal.SIGINT, signal.SIGTERM]
+        signals = [signal.SIGINT, signal.SIGTERM]
         if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
-            numbers.append(signal.SIGHUP)
-        self._handlers = {number: signal.signal(number, _nothing) for number in numbers}
+            signals.append(signal.SIGHUP)
+        self._handlers = {number: signal.signal(number, _nothing) for number in signals}
         _start_thread(self._listen)
         return self
 
@@ -116,10 +116,10 @@ class Interrupt:
                 return
             self.leave(128 + number)
         self.number = number
-        text = "stopping after the current block of updates or test; Ctrl-C again stops at once"
+        advice = "stopping after the current block of updates or test; Ctrl-C again stops at once"
         # In a thread of its own, for a screen that takes nothing must not keep this one from
         # hearing the second signal.
-        _start_thread(functools.partial(self._say, text))
+        _start_thread(functools.partial(self._say, advice))
 
 
 def _try(actions: Iterable[Callable[[], Any]]) -> None:

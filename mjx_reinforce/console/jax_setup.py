@@ -56,28 +56,28 @@ def _choose_cache() -> None:
     from jax.experimental.compilation_cache import compilation_cache
 
     variable = "JAX_COMPILATION_CACHE_DIR"
-    chosen = jax.config.values["jax_compilation_cache_dir"]
-    if chosen is None:
+    cache_folder = jax.config.values["jax_compilation_cache_dir"]
+    if cache_folder is None:
         variable = "XDG_CACHE_HOME"
         cache = os.environ.get(variable) or os.path.expanduser("~/.cache")
-        chosen = os.path.join(cache, "mjx_reinforce")
+        cache_folder = os.path.join(cache, "mjx_reinforce")
         # JAX keeps by default what took a second or more; a run has many programs that take less.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     # A cache with :// is a bucket in a cloud, of which no folder is checked.
-    if chosen and "://" not in chosen and (why := _unusable(Path(chosen))):
+    if cache_folder and "://" not in cache_folder and (obstacle := _unusable(Path(cache_folder))):
         warn(
-            f"the cache {chosen} is not used ({why}), so the next start compiles again; set "
-            f"{variable} to a folder of your own"
+            f"the cache {cache_folder} is not used ({obstacle}), so the next start compiles again; "
+            f"set {variable} to a folder of your own"
         )
-        chosen = None
+        cache_folder = None
         # A module of the user's may have compiled before this, and so have opened the cache.
         compilation_cache.reset_cache()
-    elif chosen and "://" not in chosen and not os.access(chosen, os.W_OK):
+    elif cache_folder and "://" not in cache_folder and not os.access(cache_folder, os.W_OK):
         warn(
-            f"nothing can be kept in the cache {chosen} (it cannot be written), so the next start "
-            f"compiles again what is not there; set {variable} to a folder of your own"
+            f"nothing can be kept in the cache {cache_folder} (it cannot be written), so the next "
+            f"start compiles again what is not there; set {variable} to a folder of your own"
         )
-    jax.config.update("jax_compilation_cache_dir", chosen)
+    jax.config.update("jax_compilation_cache_dir", cache_folder)
 
 
 def _unusable(folder: Path) -> str | None:

@@ -31,9 +31,9 @@ def accept_everything() -> None:
         if stream is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (stays open)
         elif type(stream) is io.TextIOWrapper:
-            raw = _Lossy(stream.fileno(), "w", closefd=False)
+            raw_stream = _Lossy(stream.fileno(), "w", closefd=False)
             lossy_stream = io.TextIOWrapper(
-                io.BufferedWriter(raw),
+                io.BufferedWriter(raw_stream),
                 stream.encoding,
                 "backslashreplace",
                 line_buffering=stream.line_buffering or stream.write_through,

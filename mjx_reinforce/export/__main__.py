@@ -58,10 +58,10 @@ def output_files(settings: ExportSettings, run: Run, seed: int) -> list[Path]:
     Raises:
       ValueError: their name does not fit, they exist, or they cannot be written.
     """
-    by_default = run.directory / f"seed_{seed}.npz"
+    default_path = run.directory / f"seed_{seed}.npz"
     if run.packaged:
-        by_default = Path(f"{run.env.replace('-', '_')}.npz")
-    output = settings.output or by_default
+        default_path = Path(f"{run.env.replace('-', '_')}.npz")
+    output = settings.output or default_path
     module = output.with_suffix(".py")
     check_output(output, settings.overwrite, ".npz")
     check_module(module, "policy.npz")

@@ -49,13 +49,13 @@ def numpy_policy(
     check_name("policy for export", family, HEADS)
     head = HEADS[family]
     params = saved.actor.params["network"]["params"]
-    dense = [params[f"Dense_{i}"] for i in range(len(params))]
-    layers = [(np.asarray(x["kernel"]), np.asarray(x["bias"])) for x in dense]
-    middle, half, arrays = _ending(head, saved.settings)
+    layer_params = [params[f"Dense_{i}"] for i in range(len(params))]
+    layers = [(np.asarray(x["kernel"]), np.asarray(x["bias"])) for x in layer_params]
+    middle, half_range, arrays = _ending(head, saved.settings)
     # Further columns are standard deviations, which the mode does not need.
-    weight, bias = (x[..., : len(half)].astype(np.float64) for x in layers[-1])
+    weight, bias = (x[..., : len(half_range)].astype(np.float64) for x in layers[-1])
     # In float64, so that an entry is rounded once, at the end.
-    layers[-1] = weight * half, bias * half + middle
+    layers[-1] = weight * half_range, bias * half_range + middle
     lines = []
     # A policy that was trained without scaled observations has a normalizer that counted nothing.
     normalizer = saved.actor.normalizer
@@ -72,7 +72,7 @@ def numpy_policy(
         lines.append(f"x = {layer}")
     lines.append(f"return {_ENDINGS[head]}")
     inputs = len(layers[0][0])
-    outputs = len(half)
+    outputs = len(half_range)
     shapes = f"[{inputs}] -> [{outputs}], or [N, {inputs}] -> [N, {outputs}]"
     if head == "argmax":
         shapes = f"[{inputs}] -> an integer, or [N, {inputs}] -> [N]"
@@ -92,7 +92,7 @@ def _ending(head: str, settings: dict[str, Any]) -> tuple[np.ndarray, np.ndarray
       settings: of the policy, see ``save_policy``.
 
     Returns:
-      ``middle`` and ``half``, one entry for each entry of the last layer, and the arrays.
+      ``middle`` and ``half_range``, one entry for each entry of the last layer, and the arrays.
     """
     space = saved_action_space(settings)
     if isinstance(space, Discrete):
@@ -102,6 +102,6 @@ def _ending(head: str, settings: dict[str, Any]) -> tuple[np.ndarray, np.ndarray
     if head == "clip":
         return means.middle, means.half, {"low": space.low, "high": space.high}
     # The mode is middle + half * tanh((mean - middle) / half): the fraction joins the last layer.
-    middle, half = middle_and_half_range(space)
-    arrays = {"middle": middle, "half": half}
-    return (means.middle - middle) / half, means.half / half, arrays
+    middle, half_range = middle_and_half_range(space)
+    arrays = {"middle": middle, "half": half_range}
+    return (means.middle - middle) / half_range, means.half / half_range, arrays

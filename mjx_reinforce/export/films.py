@@ -128,9 +128,11 @@ def _picture(take: Take, renderer: Renderer, seconds: float) -> np.ndarray:
     # A take that ended keeps its last position.
     step = min(int(seconds / take.dt + 1e-6), len(take.qpos) - 1)
     picture = renderer.draw(take.qpos[step])
-    total = np.sum(take.rewards[:step])
-    digits = 0 if abs(total) >= 100 else 1
-    return caption(picture, take.label, f"return {total:,.{digits}f}   {step * take.dt:4.1f} s")
+    total_reward = np.sum(take.rewards[:step])
+    digits = 0 if abs(total_reward) >= 100 else 1
+    return caption(
+        picture, take.label, f"return {total_reward:,.{digits}f}   {step * take.dt:4.1f} s"
+    )
 
 
 def caption(picture: np.ndarray, label: str, note: str) -> np.ndarray:

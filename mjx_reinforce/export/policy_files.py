@@ -188,28 +188,28 @@ def _untrained(policy: Policy, settings: dict[str, Any]) -> Actor:
     return Actor(params=params, normalizer=normalize.init(settings["observation_size"]))
 
 
-def _check_shapes(arrays: Arrays, expected: dict[str, Any]) -> int:
+def _check_shapes(arrays: Arrays, shape_tree: dict[str, Any]) -> int:
     """Returns how many seeds the arrays of an archive are of.
 
     Args:
       arrays: [S, ...] by name.
-      expected: what has the shape and the type of each, of one seed.
+      shape_tree: what has the shape and the type of each, of one seed.
 
     Raises:
       ValueError: they are not those, or not of the same number of seeds.
     """
-    for name in sorted(arrays.keys() ^ expected.keys()):
-        if name in expected:
+    for name in sorted(arrays.keys() ^ shape_tree.keys()):
+        if name in shape_tree:
             raise ValueError(f"{name} is missing")
         raise ValueError(f"{name} is in no policy of these settings")
     # Damaged, the count may have no axis of seeds; its own shape is found wrong below.
     num_seeds = max((*arrays["normalizer/count"].shape[:1], 1))
     for name, array in sorted(arrays.items()):
-        shape = (num_seeds, *expected[name].shape)
-        kind = expected[name].dtype
+        shape = (num_seeds, *shape_tree[name].shape)
+        kind = shape_tree[name].dtype
         # JAX has neither numbers of other machines' byte order nor longer ones than float64.
-        readable = array.dtype.isnative and array.dtype.itemsize <= np.dtype(float).itemsize
-        if array.shape != shape or array.dtype.kind != np.dtype(kind).kind or not readable:
+        is_readable = array.dtype.isnative and array.dtype.itemsize <= np.dtype(float).itemsize
+        if array.shape != shape or array.dtype.kind != np.dtype(kind).kind or not is_readable:
             raise ValueError(
                 f"{name} is {array.dtype}{list(array.shape)}, and the settings in policy.json make "
                 f"it {kind}{list(shape)}"

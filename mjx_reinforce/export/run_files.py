@@ -169,8 +169,8 @@ def choose_seed(run: Run, seed: SeedChoice, choice: PolicyChoice = "last") -> in
     returns = final_returns(run, choice)
     order = np.argsort(returns, kind="stable")
     # Not order[-1]: of equal returns, the best is that of the lowest seed.
-    ranked = {"worst": order[0], "median": order[(len(order) - 1) // 2], "best": returns.argmax()}
-    place = int(ranked[seed])
+    ranks = {"worst": order[0], "median": order[(len(order) - 1) // 2], "best": returns.argmax()}
+    place = int(ranks[seed])
     return place if run.seeds is None else run.seeds[place]
 
 

@@ -46,10 +46,10 @@ _MAX_Z = 5.0
 _SATURATED_Z = 6.0
 # The least standard deviation of z: float32 recovers z from tanh(z) to 1e-3 or better.
 _LEAST_TANH_STD = 0.005
-_PIVOT = 4.0
+_SERIES_PIVOT = 4.0
 # A bound farther away, in standard deviations, is treated as this far: it cuts off nothing either
 # way, and the square stays finite in float32.
-_FAR = 1e9
+_MAX_C = 1e9
 
 
 def tanh_normal(
@@ -79,10 +79,10 @@ def tanh_normal(
       >>> mr.tanh_normal(mr.Box(-np.ones(2), np.ones(2)))
       Distribution(2 outputs, 2 constants)
     """
-    layout = _bounded_outputs("tanh-normal", space, std, initial_std, rescale)
-    middle, half = middle_and_half_range(layout.box)
-    min_std = _LEAST_TANH_STD * half
-    initial_std = layout.initial_std
+    gaussian = _bounded_outputs("tanh-normal", space, std, initial_std, rescale)
+    middle, half_range = middle_and_half_range(gaussian.box)
+    min_std = _LEAST_TANH_STD * half_range
+    initial_std = gaussian.initial_std
     if isinstance(initial_std, np.ndarray) and np.any(initial_std < min_std):
         rounded = [float(f"{x:.6g}") for x in min_std]
         raise ValueError(
@@ -92,41 +92,41 @@ def tanh_normal(
 
     # The network's Normal is in the action's unit, as that of ``normal``; z is in half ranges.
     def to_z(mean, std):
-        return (mean - middle) / half, jnp.maximum(std / half, _LEAST_TANH_STD)
+        return (mean - middle) / half_range, jnp.maximum(std / half_range, _LEAST_TANH_STD)
 
     def sample(noise, mean, std):
         mean, std = to_z(mean, std)
         z = mean + std * noise
         # A saturated sample stands for the whole tail, whose probability ``log_prob`` then gives.
         z = jnp.where(jnp.abs(z) < _MAX_Z, z, jnp.sign(z) * _SATURATED_Z)
-        return middle + half * jnp.tanh(z)
+        return middle + half_range * jnp.tanh(z)
 
     def kl(mean, std, other_mean, other_std):
         # A one-to-one map of both variables leaves a divergence as it is.
         return normal_kl(*to_z(mean, std), *to_z(other_mean, other_std))
 
-    family = layout.family(
+    family = gaussian.family(
         sample=sample,
-        mode=lambda mean: middle + half * jnp.tanh((mean - middle) / half),
+        mode=lambda mean: middle + half_range * jnp.tanh((mean - middle) / half_range),
         log_density=lambda action, mean, std: _tanh_log_density(
-            (action - middle) / half, *to_z(mean, std), half
+            (action - middle) / half_range, *to_z(mean, std), half_range
         ),
-        entropy=lambda mean, std: _tanh_entropy(*to_z(mean, std), half),
+        entropy=lambda mean, std: _tanh_entropy(*to_z(mean, std), half_range),
         kl=kl,
     )
-    return family._replace(std=lambda outputs: half * to_z(*layout.split(outputs))[1])
+    return family._replace(std=lambda outputs: half_range * to_z(*gaussian.split(outputs))[1])
 
 
 def _tanh_log_density(
-    squashed: jax.Array, mean: jax.Array, std: jax.Array, half: np.ndarray
+    squashed: jax.Array, mean: jax.Array, std: jax.Array, half_range: np.ndarray
 ) -> jax.Array:
-    """Returns the log-probability [..., A] of half tanh(z), where z is Normal.
+    """Returns the log-probability [..., A] of half_range * tanh(z), where z is Normal.
 
     Args:
       squashed: [..., A] tanh(z).
       mean: [..., A] of z.
       std: [..., A] of z.
-      half: [A] half the width of the action's range.
+      half_range: [A] half the width of the action's range.
     """
     # No sample lies between the two values of tanh, so rounding cannot confuse the cases.
     saturated = jnp.abs(squashed) > 0.5 * (np.tanh(_MAX_Z) + np.tanh(_SATURATED_Z))
@@ -134,22 +134,22 @@ def _tanh_log_density(
     # ``where`` takes the other case.
     z = jnp.arctanh(jnp.where(saturated, 0.0, squashed))
     # The change of variables: the density of z over the slope of half tanh(z).
-    log_density = normal_log_density(z, mean, std) - _log_tanh_slope(z) - np.log(half)
+    log_density = normal_log_density(z, mean, std) - _log_tanh_slope(z) - np.log(half_range)
     log_tail_mass = log_tail((_MAX_Z - jnp.sign(squashed) * mean) / std)
     return jnp.where(saturated, log_tail_mass, log_density)
 
 
-def _tanh_entropy(mean: jax.Array, std: jax.Array, half: np.ndarray) -> jax.Array:
-    """Returns the differential entropy [..., A] in nats of half tanh(z), arguments as above.
+def _tanh_entropy(mean: jax.Array, std: jax.Array, half_range: np.ndarray) -> jax.Array:
+    """Returns the differential entropy [..., A] in nats of half_range * tanh(z), as above.
 
-    It is the entropy of z plus E[log(1 - tanh(z)^2)] + log(half), the expectation by
+    It is the entropy of z plus E[log(1 - tanh(z)^2)] + log(half_range), the expectation by
     Gauss-Hermite quadrature.
     """
     nodes, weights = np.polynomial.hermite_e.hermegauss(32)
     # Its weights belong to exp(-x^2 / 2); over their sum, sqrt(2 pi), they are probabilities.
-    rule = zip(nodes.tolist(), (weights / np.sum(weights)).tolist(), strict=True)
-    slopes = [weight * _log_tanh_slope(mean + std * node) for node, weight in rule]
-    return normal_entropy(std) + sum(slopes) + np.log(half)
+    quadrature = zip(nodes.tolist(), (weights / np.sum(weights)).tolist(), strict=True)
+    slopes = [weight * _log_tanh_slope(mean + std * node) for node, weight in quadrature]
+    return normal_entropy(std) + sum(slopes) + np.log(half_range)
 
 
 def _log_tanh_slope(z: jax.Array) -> jax.Array:
@@ -175,13 +175,13 @@ def truncated_normal(
       >>> mr.truncated_normal(mr.Box(-np.ones(2), np.ones(2)))
       Distribution(2 outputs, 2 constants)
     """
-    layout = _bounded_outputs("truncated-normal", space, std, initial_std, rescale)
+    gaussian = _bounded_outputs("truncated-normal", space, std, initial_std, rescale)
 
     def restricted(function):
         """Returns a function that hands the bounds on, after its own arguments."""
-        return lambda *arguments: function(*arguments, *_bounds(layout, arguments[-1]))
+        return lambda *arguments: function(*arguments, *_bounds(gaussian, arguments[-1]))
 
-    return layout.family(
+    return gaussian.family(
         sample=restricted(truncated_sample),
         mode=restricted(jnp.clip),
         log_density=restricted(truncated_log_density),
@@ -205,18 +205,20 @@ def _bounded_outputs(
     name: str, space: Box | Discrete, std: str, initial_std: ArrayLike | None, rescale: bool
 ) -> GaussianOutputs:
     """Returns ``gaussian_outputs``; raises ValueError besides where an entry is unbounded."""
-    layout = gaussian_outputs(name, space, std, initial_std, rescale)
-    if not np.all(np.isfinite(layout.box.low) & np.isfinite(layout.box.high)):
+    gaussian = gaussian_outputs(name, space, std, initial_std, rescale)
+    if not np.all(np.isfinite(gaussian.box.low) & np.isfinite(gaussian.box.high)):
         raise ValueError(
             f"{name} needs finite action bounds, got {space}; "
             "choose normal, or declare bounds in the environment's action_space"
         )
-    return layout
+    return gaussian
 
 
-def _bounds(layout: GaussianOutputs, like: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Returns the lower and upper bounds, [A] each, in the dtype of ``like``."""
-    return jnp.asarray(layout.box.low, like.dtype), jnp.asarray(layout.box.high, like.dtype)
+def _bounds(gaussian: GaussianOutputs, outputs: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Returns the lower and upper bounds, [A] each, in the dtype of ``outputs``."""
+    return jnp.asarray(gaussian.box.low, outputs.dtype), jnp.asarray(
+        gaussian.box.high, outputs.dtype
+    )
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -229,17 +231,17 @@ def half_line(order: int, c: jax.Array) -> jax.Array:
     """
     coefficients = _series(order, float(jnp.finfo(c.dtype).eps))
     # From [0, inf) to (-1, 1], where Chebyshev polynomials live.
-    argument = (_PIVOT - c) / (_PIVOT + c)
+    series_argument = (_SERIES_PIVOT - c) / (_SERIES_PIVOT + c)
     # Clenshaw's recurrence, from the highest coefficient down to the second.
     term = previous_term = jnp.zeros_like(c)
     for coefficient in coefficients[:0:-1]:
-        next_term = 2.0 * argument * term - previous_term + coefficient
+        next_term = 2.0 * series_argument * term - previous_term + coefficient
         previous_term = term
         term = next_term
-    total = argument * term - previous_term + coefficients[0]
+    series_sum = series_argument * term - previous_term + coefficients[0]
     # The series is that of (1 + c)^(n + 1) F_n(c), which stays finite for all c.
     scale = 1.0 / (1.0 + c)
-    return total * scale ** (order + 1)
+    return series_sum * scale ** (order + 1)
 
 
 @half_line.defjvp
@@ -263,25 +265,25 @@ def segment(order: int, c: jax.Array, width: jax.Array) -> jax.Array:
       width: [...] at least 0.
     """
     c = jnp.maximum(c, 0.0)
-    width = jnp.minimum(width, _FAR)
+    width = jnp.minimum(width, _MAX_C)
     # Minus the logarithm of the factor by which the density falls over the segment.
-    drop = width * (0.5 * width + c)
-    short = drop < 1.0
+    log_drop = width * (0.5 * width + c)
+    is_short = log_drop < 1.0
     # What lies beyond the segment: the half-line from t = width, with t = width + u and the
     # binomial theorem for t^n.
-    beyond = sum(
+    tail_integral = sum(
         math.comb(order, k) * width ** (order - k) * half_line(k, c + width)
         for k in range(order + 1)
     )
-    difference = half_line(order, c) - jnp.exp(-drop) * beyond
+    difference = half_line(order, c) - jnp.exp(-log_drop) * tail_integral
     # 0 where the result is not used, so that nothing there overflows.
-    width = jnp.where(short, width, 0.0)
+    width = jnp.where(is_short, width, 0.0)
     nodes, weights = _legendre(6 if c.dtype == jnp.float32 else 12)
     quadrature = sum(
         weight * node**order * jnp.exp(-node * width * (0.5 * node * width + c))
         for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True)
     )
-    return jnp.where(short, quadrature * width ** (order + 1), difference)
+    return jnp.where(is_short, quadrature * width ** (order + 1), difference)
 
 
 @segment.defjvp
@@ -289,8 +291,8 @@ def _segment_jvp(order, primals, tangents):
     c, width = primals
     c_slope, width_slope = tangents
     # In ``width`` the derivative is the integrand there, in c minus the next integral.
-    edge = jnp.minimum(width, _FAR) ** order * jnp.exp(-width * (0.5 * width + c))
-    slope = edge * width_slope - segment(order + 1, c, width) * c_slope
+    edge_slope = jnp.minimum(width, _MAX_C) ** order * jnp.exp(-width * (0.5 * width + c))
+    slope = edge_slope * width_slope - segment(order + 1, c, width) * c_slope
     return segment(order, c, width), slope
 
 
@@ -324,8 +326,8 @@ def truncated_log_density(
     t = (action - mode) / std
     # One of the two segments has no width, unless c is 0.
     mass = segment(0, -c, to_low) + segment(0, c, to_high)
-    value = -t * (0.5 * t + c) - jnp.log(std) - jnp.log(mass)
-    return jnp.where((action >= low) & (action <= high), value, -jnp.inf)
+    log_density = -t * (0.5 * t + c) - jnp.log(std) - jnp.log(mass)
+    return jnp.where((action >= low) & (action <= high), log_density, -jnp.inf)
 
 
 def truncated_entropy(
@@ -342,10 +344,10 @@ def truncated_entropy(
     # E[t]: to the left of the anchor t is negative, and c has the other sign.
     offset = (segment(1, c, to_high) - segment(1, -c, to_low)) / mass
     # The boundary terms: the distance of each bound times the relative density there.
-    low_edge = to_low * jnp.exp(-to_low * (0.5 * to_low - c))
-    high_edge = to_high * jnp.exp(-to_high * (0.5 * to_high + c))
-    edges = low_edge + high_edge
-    return jnp.log(std) + jnp.log(mass) + 0.5 * (1.0 + c * offset - edges / mass)
+    low_term = to_low * jnp.exp(-to_low * (0.5 * to_low - c))
+    high_term = to_high * jnp.exp(-to_high * (0.5 * to_high + c))
+    boundary_terms = low_term + high_term
+    return jnp.log(std) + jnp.log(mass) + 0.5 * (1.0 + c * offset - boundary_terms / mass)
 
 
 def truncated_kl(
@@ -368,15 +370,15 @@ def truncated_kl(
     mass = segment(0, -c, to_low) + segment(0, c, to_high)
     other_mass = segment(0, -other_c, other_to_low) + segment(0, other_c, other_to_high)
     offset = (segment(1, c, to_high) - segment(1, -c, to_low)) / mass
-    square = (segment(2, c, to_high) + segment(2, -c, to_low)) / mass
+    second_moment = (segment(2, c, to_high) + segment(2, -c, to_low)) / mass
     # r and a of the docstring.
     ratio = std / other_std
     shift = (mode - other_mode) / other_std
     log_ratio = jnp.log(other_mass / mass) - jnp.log(ratio)
     # What multiplies t and t^2 in the mean: small where the two Normals are nearly equal.
-    linear = ratio * (other_c + shift) - c
-    quadratic = 0.5 * (ratio - 1.0) * (ratio + 1.0)
-    kl = log_ratio + quadratic * square + linear * offset + shift * (0.5 * shift + other_c)
+    slope = ratio * (other_c + shift) - c
+    curvature = 0.5 * (ratio - 1.0) * (ratio + 1.0)
+    kl = log_ratio + curvature * second_moment + slope * offset + shift * (0.5 * shift + other_c)
     # Rounding may leave less than 0. It is lifted without a gradient: the derivatives of the
     # divergence of nearly equal Normals count in the natural gradient.
     return kl + jax.lax.stop_gradient(jnp.maximum(-kl, 0.0))
@@ -415,9 +417,9 @@ def _invert(c: jax.Array, mass: jax.Array) -> jax.Array:
     # Halley's method triples the number of correct digits in each step.
     for _ in range(2 if c.dtype == jnp.float32 else 3):
         mills = half_line(0, c + t)
-        excess = (t * (0.5 * t + c) - jnp.log(mills * hazard) - log_drop) * mills
-        bend = jnp.clip(1.0 / mills - c - t, 0.0, 0.8)
-        t = t - excess / (1.0 - 0.5 * bend * excess)
+        newton_step = (t * (0.5 * t + c) - jnp.log(mills * hazard) - log_drop) * mills
+        halley_factor = jnp.clip(1.0 / mills - c - t, 0.0, 0.8)
+        t = t - newton_step / (1.0 - 0.5 * halley_factor * newton_step)
     # A small drop loses its digits in the rounding of the logarithm; the guess does not, and its
     # error is only of the third order in the drop.
     return jnp.where(log_drop < eps ** (1 / 3), guess, t)
@@ -438,21 +440,21 @@ def _series(order: int, eps: float) -> tuple[float, ...]:
     ds = 0.5 * np.tile(weights, 100)
 
     # Chebyshev points in (-1, 1), and the discrete cosine transform of the values there.
-    count = 71
-    odd = 2 * np.arange(count) + 1
-    index = np.arange(count)[:, None]
-    c = _PIVOT * np.tan(0.25 * np.pi * odd / count) ** 2
+    num_points = 71
+    odd_numbers = 2 * np.arange(num_points) + 1
+    index = np.arange(num_points)[:, None]
+    c = _SERIES_PIVOT * np.tan(0.25 * np.pi * odd_numbers / num_points) ** 2
     z = 1.0 / (1.0 + c[:, None])
-    values = np.sum(ds * s**order * np.exp(-0.5 * (s * z) ** 2 - s * (1.0 - z)), axis=1)
-    cosines = np.cos(0.5 * np.pi / count * (index * odd % (4 * count)))
-    coefficients = cosines @ values * (2.0 / count)
+    integrals = np.sum(ds * s**order * np.exp(-0.5 * (s * z) ** 2 - s * (1.0 - z)), axis=1)
+    cosines = np.cos(0.5 * np.pi / num_points * (index * odd_numbers % (4 * num_points)))
+    coefficients = cosines @ integrals * (2.0 / num_points)
     coefficients[0] /= 2.0
-    large = np.nonzero(np.abs(coefficients) > max(0.1 * eps, 1e-15) * coefficients[0])[0]
-    return tuple(coefficients[: large[-1] + 1].tolist())
+    large_indices = np.nonzero(np.abs(coefficients) > max(0.1 * eps, 1e-15) * coefficients[0])[0]
+    return tuple(coefficients[: large_indices[-1] + 1].tolist())
 
 
 @functools.cache
-def _legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
+def _legendre(num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns the nodes and weights of Gauss-Legendre quadrature on [0, 1]."""
-    nodes, weights = legendre.leggauss(count)
+    nodes, weights = legendre.leggauss(num_nodes)
     return 0.5 * (nodes + 1.0), 0.5 * weights

@@ -50,8 +50,8 @@ def check_policy(
     params = traced("policy.init(key)", policy.init, jax.random.key(0))
     # Of two observations: a policy that takes a single one alone would fail in the rollout.
     observation = jax.ShapeDtypeStruct((2, observation_size), jnp.result_type(float))
-    call = f"policy.apply(params, observation [2, {observation_size}])"
-    outputs = traced(call, policy.apply, params, observation)
+    apply_call = f"policy.apply(params, observation [2, {observation_size}])"
+    outputs = traced(apply_call, policy.apply, params, observation)
     num_outputs = distribution.num_outputs
     num_constants = len(distribution.constants)
     if getattr(outputs, "shape", None) != (2, num_outputs + num_constants):
@@ -59,11 +59,11 @@ def check_policy(
         if num_constants:
             constants = f", then distribution.constants [2, {num_constants}], as parameters"
         raise ValueError(
-            f"{call} must return [2, {num_outputs + num_constants}]: what a network computes "
+            f"{apply_call} must return [2, {num_outputs + num_constants}]: what a network computes "
             f"[2, {num_outputs}]{constants}; got {described(outputs)}"
         )
     if not jnp.issubdtype(outputs.dtype, jnp.floating):
-        raise ValueError(f"{call} must return floating-point numbers, got {outputs.dtype}")
+        raise ValueError(f"{apply_call} must return floating-point numbers, got {outputs.dtype}")
 
     def draw(outputs):
         return distribution.sample(outputs, distribution.noise(jax.random.key(0), (2,)))
@@ -86,8 +86,8 @@ def check_update(update: updates.Update) -> None:
     try:
         inspect.signature(update).bind("problem", "key", "params", "opt_state")
     except (TypeError, ValueError):
-        text = f"{update.__name__}, which is to be called" if callable(update) else repr(update)
-        raise ValueError(f"update must be such as mjx_reinforce.full_batch(), got {text}") from None
+        name = f"{update.__name__}, which is to be called" if callable(update) else repr(update)
+        raise ValueError(f"update must be such as mjx_reinforce.full_batch(), got {name}") from None
 
 
 def check_estimator(
@@ -107,16 +107,16 @@ def check_estimator(
             f"this estimator needs at least {estimator.min_episodes} episodes per update, "
             f"got num_episodes={num_episodes}"
         )
-    shape = (_NUM_STEPS, num_episodes)
+    mask_shape = (_NUM_STEPS, num_episodes)
     action = null_action(env)
     float_dtype = jnp.result_type(float)
     trajectory = Trajectory(
-        observation=_shaped((*shape, observation_size), float_dtype),
-        action=_shaped((*shape, *action.shape), action.dtype),
-        reward=_shaped(shape, float_dtype),
-        mask=_shaped(shape, bool),
-        nonfinite=_shaped((num_episodes,), bool),
-        simulated=_shaped((), jnp.int32),
+        observation=_ShapeDtype((*mask_shape, observation_size), float_dtype),
+        action=_ShapeDtype((*mask_shape, *action.shape), action.dtype),
+        reward=_ShapeDtype(mask_shape, float_dtype),
+        mask=_ShapeDtype(mask_shape, bool),
+        nonfinite=_ShapeDtype((num_episodes,), bool),
+        simulated=_ShapeDtype((), jnp.int32),
     )
 
     def update(key, trajectory):
@@ -129,10 +129,12 @@ def check_estimator(
             f"got {type(estimate).__name__}"
         )
     weight, _, metrics = estimate
-    if getattr(weight, "shape", None) != shape or not jnp.issubdtype(weight.dtype, jnp.floating):
+    if getattr(weight, "shape", None) != mask_shape or not jnp.issubdtype(
+        weight.dtype, jnp.floating
+    ):
         raise ValueError(
             f"estimator.update must return a weight for every action, float [T, N], here "
-            f"{list(shape)}; got {described(weight)}"
+            f"{list(mask_shape)}; got {described(weight)}"
         )
     if not isinstance(metrics, dict):
         raise ValueError(
@@ -148,4 +150,4 @@ def traced(name: str, function: Callable[..., PyTree], *arguments: PyTree) -> An
         raise ValueError(f"{name} fails: {explain(error)}") from error
 
 
-_shaped: Any = jax.ShapeDtypeStruct
+_ShapeDtype: Any = jax.ShapeDtypeStruct

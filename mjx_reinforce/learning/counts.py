@@ -26,18 +26,18 @@ def zero() -> jax.Array:
     return jnp.zeros(2, jnp.uint32)
 
 
-def plus(count: Count, number: int | jax.Array) -> jax.Array:
+def plus(count: Count, increment: int | jax.Array) -> jax.Array:
     """Returns a count [2], a whole number [] from 0 to 2^32 - 1 later."""
     # Sums of uint32 wrap around at 2^32: one that is below what was added to has carried.
-    low = count[1] + jnp.asarray(number).astype(jnp.uint32)
-    return jnp.stack([count[0] + (low < count[1]), low])
+    low_word = count[1] + jnp.asarray(increment).astype(jnp.uint32)
+    return jnp.stack([count[0] + (low_word < count[1]), low_word])
 
 
 def reached(count: Count, limit: Count) -> jax.Array:
     """Returns whether [...] counts [..., 2] are at a limit [2] or beyond."""
-    high = jnp.asarray(count[..., 0])
-    low = jnp.asarray(count[..., 1])
-    return (high > limit[0]) | ((high == limit[0]) & (low >= limit[1]))
+    high_word = jnp.asarray(count[..., 0])
+    low_word = jnp.asarray(count[..., 1])
+    return (high_word > limit[0]) | ((high_word == limit[0]) & (low_word >= limit[1]))
 
 
 def as_float(count: Count) -> jax.Array:

@@ -49,32 +49,32 @@ def visited_steps(trajectory: Trajectory) -> Visited:
     episodes = slice(None, None, -(-trajectory.mask.shape[1] // MAX_COMPARED))
     mask = trajectory.mask[:, episodes]
     horizon, num_episodes = mask.shape
-    steps_each = min(horizon, MAX_COMPARED // num_episodes)
+    num_steps = min(horizon, MAX_COMPARED // num_episodes)
 
     # The stride [M] in time depends on how long an episode was, so times are [K, M] and traced.
     length = jnp.sum(mask, axis=0)
-    stride = jnp.maximum(-(-length // steps_each), 1)
-    time = stride // 2 + stride * jnp.arange(steps_each)[:, None]
+    stride = jnp.maximum(-(-length // num_steps), 1)
+    step_index = stride // 2 + stride * jnp.arange(num_steps)[:, None]
 
     # The steps taken of an episode share its length, so that a long episode counts for more, as it
     # does in the mean over all steps. A short episode has fewer than K; the rest have weight 0.
-    inside = time < length
-    share = jnp.where(inside, length / jnp.maximum(jnp.sum(inside, axis=0), 1), 0.0)
+    is_played = step_index < length
+    step_weight = jnp.where(is_played, length / jnp.maximum(jnp.sum(is_played, axis=0), 1), 0.0)
 
     def take(x):
         """Returns [K, M, ...] of an array [T, N, ...]; where the weight is 0, of any step."""
         entry_axes = (1,) * (x.ndim - 2)
-        index = jnp.minimum(time, horizon - 1).reshape(steps_each, num_episodes, *entry_axes)
+        index = jnp.minimum(step_index, horizon - 1).reshape(num_steps, num_episodes, *entry_axes)
         return jnp.take_along_axis(x[:, episodes], index, axis=0)
 
     return Visited(
         observation=take(trajectory.observation),
         action=take(trajectory.action),
-        weight=share / jnp.maximum(jnp.sum(length), 1),
+        weight=step_weight / jnp.maximum(jnp.sum(length), 1),
     )
 
 
-def policy_metrics(policy: Policy, before: Actor, after: Actor, visited: Visited) -> Metrics:
+def policy_metrics(policy: Policy, old_actor: Actor, new_actor: Actor, visited: Visited) -> Metrics:
     """Returns what an update made of a policy, means [] over visited steps.
 
     ``kl`` is that of ``kl_divergence`` in nats; it counts what the observations' new scale does to
@@ -82,18 +82,18 @@ def policy_metrics(policy: Policy, before: Actor, after: Actor, visited: Visited
     unit, the mean over its entries; a family that has none has no such metric.
     """
     # Both read the raw observations, each in the scale that it has itself.
-    old = act(policy, before, visited.observation)
-    new = act(policy, after, visited.observation)
-    kl = kl_divergence(policy.distribution, old, new, visited.action)
+    old_outputs = act(policy, old_actor, visited.observation)
+    new_outputs = act(policy, new_actor, visited.observation)
+    kl = kl_divergence(policy.distribution, old_outputs, new_outputs, visited.action)
     metrics = {"kl": visited.mean(kl)}
     if policy.distribution.std is not None:
-        std = jnp.mean(policy.distribution.std(old), axis=-1)
+        std = jnp.mean(policy.distribution.std(old_outputs), axis=-1)
         metrics["policy_std"] = visited.mean(std)
     return metrics
 
 
 def kl_divergence(
-    distribution: Distribution, old: jax.Array, new: jax.Array, action: jax.Array
+    distribution: Distribution, old_outputs: jax.Array, new_outputs: jax.Array, action: jax.Array
 ) -> jax.Array:
     """Returns KL(old || new) [...] in nats: exactly, or estimated from an action of the old one.
 
@@ -104,12 +104,14 @@ def kl_divergence(
 
     Args:
       distribution: the family of both.
-      old: its parameters [..., K] before the update.
-      new: its parameters after it.
+      old_outputs: its parameters [..., K] before the update.
+      new_outputs: its parameters after it.
       action: [..., A] drawn from the old one; not read where the family knows its ``kl``.
     """
     if distribution.kl is not None:
-        return distribution.kl(old, new)
+        return distribution.kl(old_outputs, new_outputs)
     # r - 1 as expm1(log r): near r = 1, where updates are small, r - 1 would cancel.
-    log_ratio = distribution.log_prob(new, action) - distribution.log_prob(old, action)
+    log_ratio = distribution.log_prob(new_outputs, action) - distribution.log_prob(
+        old_outputs, action
+    )
     return jnp.expm1(log_ratio) - log_ratio

@@ -123,8 +123,8 @@ def normal(
       >>> family.mode(outputs).tolist(), family.log_prob(outputs, jnp.zeros(2)).shape
       ([0.0, 0.0], ())
     """
-    layout = gaussian_outputs("normal", space, std, initial_std, rescale)
-    return layout.family(
+    gaussian = gaussian_outputs("normal", space, std, initial_std, rescale)
+    return gaussian.family(
         sample=lambda noise, mean, std: mean + std * noise,
         mode=lambda mean: mean,
         log_density=normal_log_density,
@@ -176,8 +176,8 @@ def categorical(
 
     def log_prob(outputs, action):
         # By a mask and not by an index: the gradient of a gather is a scatter, slow on GPUs.
-        chosen = jnp.arange(size) == action[..., None]
-        return jnp.sum(jnp.where(chosen, jax.nn.log_softmax(outputs), 0.0), axis=-1)
+        is_taken = jnp.arange(size) == action[..., None]
+        return jnp.sum(jnp.where(is_taken, jax.nn.log_softmax(outputs), 0.0), axis=-1)
 
     def entropy(outputs):
         log_probs = jax.nn.log_softmax(outputs)
@@ -227,19 +227,21 @@ class GaussianOutputs(NamedTuple):
 
     def split(self, outputs: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Returns the means and standard deviations, [..., A] each."""
-        raw = outputs[..., self.size :]
-        initial = self.initial_std
+        raw_std = outputs[..., self.size :]
+        initial_std = self.initial_std
         # A fresh network's outputs are near 0; the added constants make the std initial_std there.
         if self.std == "parameter":
-            std = jnp.exp(raw)
+            std = jnp.exp(raw_std)
         elif self.std == "softplus":
             # Of a large std, exp would overflow; the logarithm is then the std itself.
-            offset = np.where(initial < 30, np.log(np.expm1(np.minimum(initial, 30))), initial)
-            std = jax.nn.softplus(raw + offset.astype(raw.dtype)) + _MIN_STD
+            offset = np.where(
+                initial_std < 30, np.log(np.expm1(np.minimum(initial_std, 30))), initial_std
+            )
+            std = jax.nn.softplus(raw_std + offset.astype(raw_std.dtype)) + _MIN_STD
         else:
             # The inverse of the sigmoid at the initial std.
-            offset = np.log(initial / (1.0 - initial))
-            std = jax.nn.sigmoid(raw + offset.astype(raw.dtype)) + _MIN_STD
+            offset = np.log(initial_std / (1.0 - initial_std))
+            std = jax.nn.sigmoid(raw_std + offset.astype(raw_std.dtype)) + _MIN_STD
         return self.mean(outputs), std
 
     def family(
@@ -311,33 +313,33 @@ def gaussian_outputs(
         )
     if std not in ("parameter", "softplus", "sigmoid"):
         raise ValueError(f"std must be 'parameter', 'softplus' or 'sigmoid', got {std!r}")
-    middle, half = middle_and_half_range(space)
+    middle, half_range = middle_and_half_range(space)
     if initial_std is None:
         initial_std = default_std(space)
         # A sigmoid stays below 1, whatever the action's range.
         if std == "sigmoid":
             initial_std = np.minimum(initial_std, _STD_SHARE)
-    shape = np.shape(initial_std)
-    if shape not in ((), middle.shape):
+    std_shape = np.shape(initial_std)
+    if std_shape not in ((), middle.shape):
         raise ValueError(
             f"initial_std must be a number, or {list(middle.shape)}, one for each entry, "
             f"got {initial_std}"
         )
     # One by one: an entry may be traced, and is then taken on trust.
-    for entry in initial_std if shape else (initial_std,):  # type: ignore[union-attr]
-        check_number("initial_std", entry, positive=True)
-        number = known_number(entry)
-        if std == "sigmoid" and number is not None and number >= 1:
+    for entry_std in initial_std if std_shape else (initial_std,):  # type: ignore[union-attr]
+        check_number("initial_std", entry_std, positive=True)
+        known_std = known_number(entry_std)
+        if std == "sigmoid" and known_std is not None and known_std >= 1:
             raise ValueError(
-                f"a sigmoid std stays below 1, got initial_std={number}, in the action's unit; "
+                f"a sigmoid std stays below 1, got initial_std={known_std}, in the action's unit; "
                 "give a smaller one, or choose normal"
             )
     if not rescale:
         middle = np.zeros_like(middle)
-        half = np.ones_like(half)
+        half_range = np.ones_like(half_range)
     if not isinstance(initial_std, jax.core.Tracer):
         initial_std = np.asarray(initial_std, float)
-    return GaussianOutputs(space, std, initial_std, middle, half)
+    return GaussianOutputs(space, std, initial_std, middle, half_range)
 
 
 def default_std(space: Box) -> np.ndarray:
@@ -393,7 +395,7 @@ def middle_and_half_range(space: Box) -> tuple[np.ndarray, np.ndarray]:
     low = np.asarray(space.low, np.float32)
     high = np.asarray(space.high, np.float32)
     # The range [-1, 1] has the center 0 and the half width 1.
-    bounded = np.isfinite(low) & np.isfinite(high)
-    low = np.where(bounded, low, -1.0)
-    high = np.where(bounded, high, 1.0)
+    is_bounded = np.isfinite(low) & np.isfinite(high)
+    low = np.where(is_bounded, low, -1.0)
+    high = np.where(is_bounded, high, 1.0)
     return (low + high) / 2, (high - low) / 2

@@ -103,16 +103,16 @@ def leave_one_out(discount: float | jax.Array = 0.99) -> Estimator:
       >>> mr.leave_one_out(discount=1.0)
       Estimator(of 2 episodes or more)
     """
-    return _less_others(discount, counts=jnp.ones_like)
+    return _less_others(discount, step_filter=jnp.ones_like)
 
 
 def leave_one_out_alive(discount: float | jax.Array = 0.99) -> Estimator:
     """``leave_one_out`` with the mean of those that still run at t alone, 0 where none does."""
-    return _less_others(discount, counts=lambda mask: mask)
+    return _less_others(discount, step_filter=lambda mask: mask)
 
 
 def _less_others(
-    discount: float | jax.Array, counts: Callable[[jax.Array], jax.Array]
+    discount: float | jax.Array, step_filter: Callable[[jax.Array], jax.Array]
 ) -> Estimator:
     """An estimator of G[t] less the mean of the other episodes that count, from the mask."""
     check_discount(discount)
@@ -121,14 +121,14 @@ def _less_others(
         """Returns G[t, n] - b[t, n] with the baseline b, the mean G[t] of the other episodes."""
         returns = _returns(trajectory, discount)
         # Sums over all episodes [T, 1] less the own term: N means in one pass, not N times N - 1.
-        counted = counts(trajectory.mask)
-        num_others = jnp.sum(counted, axis=1, keepdims=True) - counted
-        sums = jnp.sum(jnp.where(counted, returns, 0.0), axis=1, keepdims=True)
-        baseline = (sums - jnp.where(counted, returns, 0.0)) / jnp.maximum(num_others, 1)
+        baseline_mask = step_filter(trajectory.mask)
+        num_others = jnp.sum(baseline_mask, axis=1, keepdims=True) - baseline_mask
+        sums = jnp.sum(jnp.where(baseline_mask, returns, 0.0), axis=1, keepdims=True)
+        baseline = (sums - jnp.where(baseline_mask, returns, 0.0)) / jnp.maximum(num_others, 1)
         weight = returns - jnp.where(num_others > 0, baseline, 0.0)
         weight = jnp.where(trajectory.mask, weight, 0.0)
-        explained = explained_variance(weight, returns, trajectory.mask)
-        return weight, state, {"explained_variance": explained}
+        explained_share = explained_variance(weight, returns, trajectory.mask)
+        return weight, state, {"explained_variance": explained_share}
 
     return Estimator(lambda key, observation_size: (), update, min_episodes=2)
 
@@ -169,15 +169,15 @@ def standardize(
         if center:
             mean = jnp.sum(jnp.where(mask, weight, 0.0)) / steps
         # In a unit in which the squares do not overflow.
-        unit = _unit(jnp.where(mask, weight - mean, 0.0))
-        variance = jnp.sum(jnp.where(mask, ((weight - mean) / unit) ** 2, 0.0)) / steps
-        std = unit * jnp.sqrt(variance)
+        weight_unit = _unit(jnp.where(mask, weight - mean, 0.0))
+        variance = jnp.sum(jnp.where(mask, ((weight - mean) / weight_unit) ** 2, 0.0)) / steps
+        std = weight_unit * jnp.sqrt(variance)
         # What summing the rewards of an episode may round, [N]; an episode that broke has no
         # rewards to speak of.
         rounding = jnp.sum(jnp.finfo(weight.dtype).eps * jnp.abs(trajectory.reward), axis=0)
-        varies = std + floor > jnp.max(jnp.where(trajectory.nonfinite, 0.0, rounding))
-        scaled = jnp.where(mask & varies, (weight - mean) / (std + floor), 0.0)
-        return scaled, state, metrics | {"weight_std": std}
+        has_spread = std + floor > jnp.max(jnp.where(trajectory.nonfinite, 0.0, rounding))
+        scaled_weight = jnp.where(mask & has_spread, (weight - mean) / (std + floor), 0.0)
+        return scaled_weight, state, metrics | {"weight_std": std}
 
     return estimator._replace(update=update)
 
@@ -237,9 +237,9 @@ def explained_variance(residual: jax.Array, returns: jax.Array, mask: jax.Array)
     steps = jnp.maximum(jnp.sum(mask), 1)
 
     # The ratio does not depend on the unit, but squares of large returns would overflow.
-    unit = _unit(jnp.where(mask, returns, 0.0))
-    residual = residual / unit
-    returns = returns / unit
+    return_unit = _unit(jnp.where(mask, returns, 0.0))
+    residual = residual / return_unit
+    returns = returns / return_unit
 
     def mean(x):
         return jnp.sum(jnp.where(mask, x, 0.0)) / steps
@@ -247,10 +247,12 @@ def explained_variance(residual: jax.Array, returns: jax.Array, mask: jax.Array)
     def variance(x):
         return mean((x - mean(x)) ** 2)
 
-    total = variance(returns)
+    total_variance = variance(returns)
     # A deviation of 1e-6 of the mean is some ten roundings of float32.
-    varies = total > 1e-12 * mean(returns) ** 2
-    return jnp.where(varies, 1.0 - variance(residual) / jnp.where(varies, total, 1.0), jnp.nan)
+    has_spread = total_variance > 1e-12 * mean(returns) ** 2
+    return jnp.where(
+        has_spread, 1.0 - variance(residual) / jnp.where(has_spread, total_variance, 1.0), jnp.nan
+    )
 
 
 def _unit(x: jax.Array) -> jax.Array:
@@ -261,8 +263,8 @@ def _unit(x: jax.Array) -> jax.Array:
 
 def check_discount(discount: float | jax.Array) -> None:
     """Raises ValueError for a discount outside [0, 1]; a traced one is taken on trust."""
-    number = known_number(discount)
-    if not (number is None or 0.0 <= number <= 1.0):
+    known_discount = known_number(discount)
+    if not (known_discount is None or 0.0 <= known_discount <= 1.0):
         raise ValueError(f"the discount must lie in [0, 1], got {discount!r}")
 
 
@@ -285,15 +287,15 @@ def discounted_returns(reward: jax.Array, discount: float | jax.Array) -> jax.Ar
     # G within each block, as if nothing came after it.
     block_returns = _discounted_sums(blocks, discount)
     # G at the first step of each block [B, N], where a step from block to block is L steps.
-    total = _discounted_sums(block_returns[:, 0], jnp.power(discount, length))
+    block_start_returns = _discounted_sums(block_returns[:, 0], jnp.power(discount, length))
     # What the next block adds, from L, L - 1, ..., 1 steps away.
-    later = jnp.pad(total[1:], ((0, 1), (0, 0)))
+    next_block_returns = jnp.pad(block_start_returns[1:], ((0, 1), (0, 0)))
     steps_left = jnp.arange(length, 0, -1, dtype=reward.dtype)
-    returns = block_returns + jnp.power(discount, steps_left)[:, None] * later[:, None]
+    returns = block_returns + jnp.power(discount, steps_left)[:, None] * next_block_returns[:, None]
     return returns.reshape(-1, num_episodes)[:horizon]
 
 
-def replace_broken(returns: jax.Array, broken: jax.Array) -> jax.Array:
+def replace_broken(returns: jax.Array, is_nonfinite: jax.Array) -> jax.Array:
     """Returns the returns, of an episode that broke the least of the others'.
 
     What it earned until the simulation left the finite numbers is no return: where rewards are
@@ -302,17 +304,17 @@ def replace_broken(returns: jax.Array, broken: jax.Array) -> jax.Array:
 
     Args:
       returns: [..., N] such as G [T, N]; the others are those of the same step.
-      broken: [N] ``Trajectory.nonfinite``; where all are, all returns are infinite.
+      is_nonfinite: [N] ``Trajectory.nonfinite``; where all are, all returns are infinite.
     """
-    least = jnp.min(jnp.where(broken, jnp.inf, returns), axis=-1, keepdims=True)
-    return jnp.where(broken, least, returns)
+    least_return = jnp.min(jnp.where(is_nonfinite, jnp.inf, returns), axis=-1, keepdims=True)
+    return jnp.where(is_nonfinite, least_return, returns)
 
 
 def _discounted_sums(x: jax.Array, discount: jax.Array) -> jax.Array:
     """Returns y [..., T, N] with ``y[t] = x[t] + discount * y[t + 1]`` and ``y[T] = 0``."""
-    time = jnp.arange(x.shape[-2], dtype=x.dtype)
+    step_index = jnp.arange(x.shape[-2], dtype=x.dtype)
     # A matrix [T, T] of discount^(s - t) where s >= t, else 0. The exponent is clipped besides:
     # a negative power of 0 is infinite.
-    ahead = time - time[:, None]
-    factors = jnp.where(ahead < 0, 0, jnp.power(discount, jnp.maximum(ahead, 0)))
-    return jnp.matmul(factors, x, precision="highest")
+    steps_ahead = step_index - step_index[:, None]
+    powers = jnp.where(steps_ahead < 0, 0, jnp.power(discount, jnp.maximum(steps_ahead, 0)))
+    return jnp.matmul(powers, x, precision="highest")

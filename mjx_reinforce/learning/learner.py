@@ -222,7 +222,9 @@ def reinforce(
     actor_shapes = jax.eval_shape(functools.partial(first_actor, policy, size), jax.random.key(0))
     # Three times: the parameters, their gradient, and what they become.
     check_room(3.0 * sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(actor_shapes)))
-    acting = choice.ActingPolicy(functools.partial(act, policy), actor_shapes, policy.distribution)
+    actor_policy = choice.ActingPolicy(
+        functools.partial(act, policy), actor_shapes, policy.distribution
+    )
     parts = _Reinforce(
         env=env,
         policy=policy,
@@ -235,7 +237,7 @@ def reinforce(
         max_kl=max_kl,
         normalize_steps=normalize_steps,
         normalize_min_std=normalize_min_std,
-        engine=choice.choose(engine, env, acting, horizon),
+        engine=choice.choose(engine, env, actor_policy, horizon),
     )
     return Learner(parts.init, RolloutPlay(parts.play), parts.learn, policy, parts.engine)
 
@@ -326,7 +328,7 @@ class _Reinforce:
         Shapes are [T, N]: T steps of each of N episodes, of which those in the mask were played.
         """
         # The actor that played: theta, the parameters of pi, and the scale of its observations.
-        before = state.actor
+        old_actor = state.actor
         # The few steps at which the policies before and after the update are compared.
         visited = diagnostics.visited_steps(trajectory)
 
@@ -335,56 +337,60 @@ class _Reinforce:
         overflow = ~jnp.isfinite(episode_returns(trajectory))
         trajectory = trajectory.replace(nonfinite=trajectory.nonfinite | overflow)
 
-        # o[t, n]: observations [T, N, O] as the policy saw them, in the scale of ``before``. The
+        # o[t, n]: observations [T, N, O] as the policy saw them, in the scale of ``old_actor``. The
         # scale of after the update would give the actions other probabilities than they had.
-        scaled = normalize.scale_observations(before.normalizer, trajectory)
+        scaled_trajectory = normalize.scale_observations(old_actor.normalizer, trajectory)
 
         # w[t, n]: the weights [T, N] of the score (Williams 1992, equation 8), from rewards, and
         # from observations where a baseline is learned. That baseline is in ``estimator_state``. It
         # is fitted to these returns after it was subtracted from them: one that had seen an
         # action's own return would bias the gradient.
         weight, estimator_state, estimator_metrics = self.estimator.update(
-            state.estimator_state, scaled
+            state.estimator_state, scaled_trajectory
         )
 
         # theta: the optimizer's steps. The value of the surrogate means nothing; its gradient at
         # the old theta is minus the formula's.
-        problem = self._problem(state, scaled, weight)
-        params, opt_state, step_metrics = self.update(problem, key, before.params, state.opt_state)
+        problem = self._problem(state, scaled_trajectory, weight)
+        params, opt_state, step_metrics = self.update(
+            problem, key, old_actor.params, state.opt_state
+        )
 
         # The next scale, from the raw observations: scaled ones would always have mean 0 and
         # standard deviation 1. An episode that broke is left out whole.
         sound_steps = trajectory.mask & ~trajectory.nonfinite
         normalizer = normalize.update(
-            before.normalizer,
+            old_actor.normalizer,
             trajectory.observation,
             sound_steps,
-            at_most=self.normalize_steps,
+            max_count=self.normalize_steps,
             min_std=self.normalize_min_std,
         )
 
         # A trust region (Schulman et al. 2015, arXiv:1502.05477): parameters and scale both change
         # what the policy does, so the two are shortened together.
         proposal = Actor(params=params, normalizer=normalizer)
-        actor = trust_region.within_kl(self.policy, before, proposal, visited, self.max_kl)
-        after = state.replace(actor=actor, opt_state=opt_state, estimator_state=estimator_state)
+        actor = trust_region.within_kl(self.policy, old_actor, proposal, visited, self.max_kl)
+        next_state = state.replace(
+            actor=actor, opt_state=opt_state, estimator_state=estimator_state
+        )
 
         # Without one sound episode, or with a norm that overflows, the step would say nothing.
-        sound = ~jnp.all(trajectory.nonfinite)
-        sound &= jnp.isfinite(step_metrics.get("gradient_norm", 0.0))
-        after, skipped = keep_finite(after, state, sound)
+        is_sound = ~jnp.all(trajectory.nonfinite)
+        is_sound &= jnp.isfinite(step_metrics.get("gradient_norm", 0.0))
+        next_state, num_skipped = keep_finite(next_state, state, is_sound)
 
         # Measured of the actor that was kept, at the same steps at which the change was limited.
-        change = diagnostics.policy_metrics(self.policy, before, after.actor, visited)
-        measurements = estimator_metrics | step_metrics | change
-        return after, update_metrics(trajectory, skipped, measurements)
+        policy_kl = diagnostics.policy_metrics(self.policy, old_actor, next_state.actor, visited)
+        measurements = estimator_metrics | step_metrics | policy_kl
+        return next_state, update_metrics(trajectory, num_skipped, measurements)
 
-    def _problem(self, state: TrainState, scaled: Trajectory, weight: jax.Array) -> Problem:
+    def _problem(self, state: TrainState, trajectory: Trajectory, weight: jax.Array) -> Problem:
         """Returns minus the sum in the formula, and all else that an ``Update`` reads.
 
         Args:
           state: before the update.
-          scaled: [T, N] what was played, with scaled observations.
+          trajectory: [T, N] what was played, with scaled observations.
           weight: [T, N] w, from the estimator.
         """
         distribution = self.policy.distribution
@@ -403,14 +409,14 @@ class _Reinforce:
         return Problem(
             surrogate=surrogate,
             optimizer=self.optimizer,
-            samples=(scaled.observation, scaled.action, weight, scaled.mask),
+            samples=(trajectory.observation, trajectory.action, weight, trajectory.mask),
             # By N, not by the steps that were played, which depend on the policy.
             divisor=self.num_episodes,
             clock=Clock(state.progress, counts.as_float(state.env_steps)),
         )
 
 
-_step = jax.jit(Learner.step, static_argnums=0)
+_jitted_step = jax.jit(Learner.step, static_argnums=0)
 
 
 def train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics]:
@@ -448,36 +454,36 @@ def train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics
     """
     # Before it is traced: of a wrong argument, jit would say that it is no JAX type.
     check_kind("state", state, TrainState, "learner.init(jax.random.key(0))")
-    return _step(learner, state)
+    return _jitted_step(learner, state)
 
 
 # All that a jitted function has besides, to compile ahead of time and to see shapes and costs.
 vars(train_step).update(
-    {name: getattr(_step, name) for name in ("lower", "eval_shape", "trace", "clear_cache")}
+    {name: getattr(_jitted_step, name) for name in ("lower", "eval_shape", "trace", "clear_cache")}
 )
 
 
 def keep_finite(
-    candidate: TrainState, before: TrainState, sound: jax.Array | bool = True
+    candidate: TrainState, old_state: TrainState, is_sound: jax.Array | bool = True
 ) -> tuple[TrainState, jax.Array]:
-    """Returns ``candidate`` and 0 if all of it is finite and sound, else ``before`` and 1.
+    """Returns ``candidate`` and 0 if all of it is finite and sound, else ``old_state`` and 1.
 
     So an update that breaks costs its seed that one update.
     """
     # Floats are joined into one vector for the choice. With a choice for each leaf XLA's CPU
     # backend makes a program for each, and each of them computes again what they share.
     new_floats, unravel = ravel_pytree(list(filter(is_float, jax.tree.leaves(candidate))))
-    old_floats, _ = ravel_pytree(list(filter(is_float, jax.tree.leaves(before))))
-    finite = jnp.all(jnp.isfinite(new_floats)) & sound
-    chosen_floats = iter(unravel(jnp.where(finite, new_floats, old_floats)))
+    old_floats, _ = ravel_pytree(list(filter(is_float, jax.tree.leaves(old_state))))
+    is_finite = jnp.all(jnp.isfinite(new_floats)) & is_sound
+    chosen_floats = iter(unravel(jnp.where(is_finite, new_floats, old_floats)))
 
     def choose(new: jax.Array, old: jax.Array) -> jax.Array:
         # ``jax.tree.map`` visits leaves in the order of ``jax.tree.leaves`` above.
         if is_float(new):
             return next(chosen_floats)
-        return new if new is old else jnp.where(finite, new, old)  # no update touches the key
+        return new if new is old else jnp.where(is_finite, new, old)  # no update touches the key
 
-    return jax.tree.map(choose, candidate, before), jnp.where(finite, 0, 1)
+    return jax.tree.map(choose, candidate, old_state), jnp.where(is_finite, 0, 1)
 
 
 def is_float(x: jax.Array) -> bool:
@@ -485,19 +491,23 @@ def is_float(x: jax.Array) -> bool:
     return jnp.issubdtype(x.dtype, jnp.floating)
 
 
-def update_metrics(trajectory: Trajectory, skipped: jax.Array, measurements: Metrics) -> Metrics:
+def update_metrics(
+    trajectory: Trajectory, num_skipped: jax.Array, measurements: Metrics
+) -> Metrics:
     """Returns the metrics of an update, see ``train_step``.
 
     Args:
       trajectory: what was played.
-      skipped: [] 1 if the update was not finite, else 0.
+      num_skipped: [] 1 if the update was not finite, else 0.
       measurements: the rest of the metrics; their floats are NaN where the update was not finite.
     """
     returns = episode_returns(trajectory)
     lengths = episode_lengths(trajectory)
     # Means over steps of which some are garbage say nothing. NaN is a gap in a chart, 0 a value.
-    sound = (skipped == 0) & ~jnp.any(trajectory.nonfinite)
-    floats = {name: jnp.where(sound, x, jnp.nan) for name, x in measurements.items() if is_float(x)}
+    is_sound = (num_skipped == 0) & ~jnp.any(trajectory.nonfinite)
+    floats = {
+        name: jnp.where(is_sound, x, jnp.nan) for name, x in measurements.items() if is_float(x)
+    }
     return {
         "episodes": jnp.int32(trajectory.mask.shape[1]),
         "episode_return": jnp.mean(returns),
@@ -508,5 +518,5 @@ def update_metrics(trajectory: Trajectory, skipped: jax.Array, measurements: Met
         "simulated_steps": trajectory.simulated,
         "nonfinite_episodes": jnp.sum(trajectory.nonfinite),
         **(measurements | floats),
-        "skipped_update": skipped,
+        "skipped_update": num_skipped,
     }

@@ -89,16 +89,16 @@ def natural_gradient(
 
     def turn(problem, key, params, gradient):
         """Returns the step, sqrt(2 max_kl / g'x) x with x = (F + damping I)^-1 g, a pytree."""
-        flat, unravel = ravel_pytree(gradient)
+        flat_gradient, unravel = ravel_pytree(gradient)
         # The step does not depend on the length of g; of a unit vector nothing over- or underflows.
-        norm = jnp.linalg.norm(flat)
-        unit = flat / jnp.where(norm > 0, norm, 1.0)
-        direction = ravel_pytree(solve(problem, key, params, unravel(unit)))[0]
+        norm = jnp.linalg.norm(flat_gradient)
+        unit_gradient = flat_gradient / jnp.where(norm > 0, norm, 1.0)
+        direction = ravel_pytree(solve(problem, key, params, unravel(unit_gradient)))[0]
         # g'x is positive, as the matrix is positive definite; without a gradient it is 0, and the
         # policy stays.
-        slope = jnp.vdot(unit, direction, precision="highest")
+        slope = jnp.vdot(unit_gradient, direction, precision="highest")
         length = jnp.where(slope > 0, jnp.sqrt(2 * max_kl / jnp.where(slope > 0, slope, 1.0)), 0.0)
-        return unravel((length * direction).astype(flat.dtype))
+        return unravel((length * direction).astype(flat_gradient.dtype))
 
     return whole_rollout(turn)
 
@@ -116,9 +116,9 @@ def _by_conjugate_gradients(
         # inside the mask; otherwise those outside have no share.
         if mask.size > MAX_FISHER_STEPS:
             observation = observation[draw_steps(key, mask, (MAX_FISHER_STEPS,))]
-            share = jnp.full(MAX_FISHER_STEPS, 1 / MAX_FISHER_STEPS)
+            step_weight = jnp.full(MAX_FISHER_STEPS, 1 / MAX_FISHER_STEPS)
         else:
-            share = mask.reshape(-1) / jnp.maximum(jnp.sum(mask), 1)
+            step_weight = mask.reshape(-1) / jnp.maximum(jnp.sum(mask), 1)
 
         def outputs(params):
             return policy.apply(params, observation)
@@ -129,7 +129,7 @@ def _by_conjugate_gradients(
 
         def mean_kl(new_outputs):
             kl = policy.distribution.kl
-            return jnp.sum(share * kl(old_outputs, new_outputs))  # type: ignore[misc]
+            return jnp.sum(step_weight * kl(old_outputs, new_outputs))  # type: ignore[misc]
 
         # H u: the derivative of KL's gradient in the outputs [S, K], at new = old.
         hessian_product = jax.linearize(jax.grad(mean_kl), old_outputs)[1]

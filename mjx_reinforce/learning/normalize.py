@@ -8,11 +8,11 @@ from mjx_reinforce.engine.base import Trajectory
 
 #: Scaled observations are clipped to plus or minus this many standard deviations.
 CLIP = 10.0
-_LEAST_STD = 1e-4
+_MIN_STD = 1e-4
 #: Whole numbers are exact in float32 up to this.
-_EXACT = 2**24
+_MAX_EXACT = 2**24
 # A larger observation counts as this: float32 holds the sum of the squares of 1e8 of them.
-_LARGEST = 1e15
+_MAX_OBSERVATION = 1e15
 
 
 class Normalizer(struct.PyTreeNode, kw_only=True):
@@ -41,7 +41,7 @@ def update(
     normalizer: Normalizer,
     observation: jax.Array,
     mask: jax.Array,
-    at_most: float,
+    max_count: float,
     min_std: float | jax.Array = 0.0,
 ) -> Normalizer:
     """Merges a batch into the statistics, unless enough observations are counted already.
@@ -54,7 +54,7 @@ def update(
       observation: [T, N, O]; entries outside the mask have no effect, and one beyond 1e15 counts
         as 1e15.
       mask: [T, N] True where the observation counts.
-      at_most: a batch is merged only if fewer observations than this are counted so far.
+      max_count: a batch is merged only if fewer observations than this are counted so far.
       min_std: a smaller standard deviation of the two together is raised to this, in the
         observation's unit, and has that size when the next batch is merged.
 
@@ -63,25 +63,25 @@ def update(
     """
     # With an empty mask the batch has no weight, and everything below leaves the statistics alone:
     # there is no branch, which would be run both ways under ``vmap`` anyway.
-    mask = mask & (normalizer.count < at_most)
-    inside = mask[..., None]
-    observation = jnp.clip(observation, -_LARGEST, _LARGEST)
+    mask = mask & (normalizer.count < max_count)
+    is_played = mask[..., None]
+    observation = jnp.clip(observation, -_MAX_OBSERVATION, _MAX_OBSERVATION)
     count = jnp.sum(mask, dtype=normalizer.count.dtype)
     divisor = jnp.maximum(count, 1.0)
-    mean = jnp.sum(jnp.where(inside, observation, 0.0), axis=(0, 1)) / divisor
-    m2 = jnp.sum(jnp.where(inside, (observation - mean) ** 2, 0.0), axis=(0, 1))
-    total = jnp.maximum(normalizer.count + count, 1.0)
+    mean = jnp.sum(jnp.where(is_played, observation, 0.0), axis=(0, 1)) / divisor
+    m2 = jnp.sum(jnp.where(is_played, (observation - mean) ** 2, 0.0), axis=(0, 1))
+    total_count = jnp.maximum(normalizer.count + count, 1.0)
     delta = mean - normalizer.mean
     # XLA would compile the sums below otherwise beside ``_m2_of_long_count``, and round them
     # otherwise.
     operands = jax.lax.optimization_barrier((normalizer, count, delta, m2))
     # Chan et al.: the squares within each part, and those between the parts' means.
-    m2 = normalizer.m2 + m2 + delta**2 * normalizer.count * count / total
-    m2 = jnp.where(total > _EXACT, _m2_of_long_count(*operands), m2)
+    m2 = normalizer.m2 + m2 + delta**2 * normalizer.count * count / total_count
+    m2 = jnp.where(total_count > _MAX_EXACT, _m2_of_long_count(*operands), m2)
     # The floor goes into m2: ``apply`` has the statistics alone, and knows no floor.
     return Normalizer(
         count=normalizer.count + count,
-        mean=normalizer.mean + delta * count / total,
+        mean=normalizer.mean + delta * count / total_count,
         m2=jnp.maximum(m2, min_std**2 * (normalizer.count + count)),
     )
 
@@ -100,26 +100,28 @@ def _m2_of_long_count(
       delta: [O] its mean minus theirs.
       m2: [O] its sum of squares.
     """
-    total = jnp.maximum(normalizer.count + count, 1.0)
+    total_count = jnp.maximum(normalizer.count + count, 1.0)
     variance = normalizer.m2 / jnp.maximum(normalizer.count, 1.0)
     # Not ``count``: what of it is left where float32 rounds the long count.
-    share = (normalizer.count + count - normalizer.count) / total
-    excess = m2 / jnp.maximum(count, 1.0) + delta**2 * normalizer.count / total - variance
-    return (variance + share * excess) * total
+    new_share = (normalizer.count + count - normalizer.count) / total_count
+    variance_change = (
+        m2 / jnp.maximum(count, 1.0) + delta**2 * normalizer.count / total_count - variance
+    )
+    return (variance + new_share * variance_change) * total_count
 
 
-def between(before: Normalizer, after: Normalizer, share: jax.Array) -> Normalizer:
-    """Returns the statistics that a share [] of the way leads to; 1 leads to ``after`` itself.
+def between(old_normalizer: Normalizer, new_normalizer: Normalizer, share: jax.Array) -> Normalizer:
+    """Returns the statistics that a share [] of the way leads to; 1 leads to ``new_normalizer``.
 
     Before the first observation the scale is 1, and it moves from there.
     """
-    partway = jax.tree.map(lambda old, new: old + share * (new - old), before, after)
+    blend = jax.tree.map(lambda old, new: old + share * (new - old), old_normalizer, new_normalizer)
     # The variance goes from 1 to the first one; m2 is the count times that.
-    variance = after.m2 / jnp.maximum(after.count, 1.0)
-    first_m2 = partway.count * (1.0 + share * (variance - 1.0))
-    partway = partway.replace(m2=jnp.where(before.count > 0, partway.m2, first_m2))
+    variance = new_normalizer.m2 / jnp.maximum(new_normalizer.count, 1.0)
+    first_m2 = blend.count * (1.0 + share * (variance - 1.0))
+    blend = blend.replace(m2=jnp.where(old_normalizer.count > 0, blend.m2, first_m2))
     # old + 1 * (new - old) is not new in floating point.
-    return jax.tree.map(lambda old, new: jnp.where(share < 1.0, old, new), partway, after)
+    return jax.tree.map(lambda old, new: jnp.where(share < 1.0, old, new), blend, new_normalizer)
 
 
 def apply(normalizer: Normalizer, observation: jax.Array) -> jax.Array:
@@ -128,8 +130,8 @@ def apply(normalizer: Normalizer, observation: jax.Array) -> jax.Array:
     While no observation is counted, it is returned unchanged.
     """
     std = standard_deviation(normalizer)
-    scaled = jnp.clip((observation - normalizer.mean) / std, -CLIP, CLIP)
-    return jnp.where(normalizer.count > 0, scaled, observation)
+    scaled_observation = jnp.clip((observation - normalizer.mean) / std, -CLIP, CLIP)
+    return jnp.where(normalizer.count > 0, scaled_observation, observation)
 
 
 def scale_observations(normalizer: Normalizer, trajectory: Trajectory) -> Trajectory:
@@ -140,4 +142,4 @@ def scale_observations(normalizer: Normalizer, trajectory: Trajectory) -> Trajec
 def standard_deviation(normalizer: Normalizer) -> jax.Array:
     """Returns what ``apply`` divides by, [O]: the standard deviation, and 1e-4 at least."""
     variance = normalizer.m2 / jnp.maximum(normalizer.count, 1.0)
-    return jnp.maximum(jnp.sqrt(variance), _LEAST_STD)
+    return jnp.maximum(jnp.sqrt(variance), _MIN_STD)

@@ -64,9 +64,9 @@ class MLP(nn.Module):
 def _symmetric_uniform(bound: float) -> nn.initializers.Initializer:
     """Returns an initializer that draws from the uniform distribution on (-bound, bound)."""
 
-    def draw(key, shape, dtype=float, out_sharding=None):
+    def draw(key, kernel_shape, dtype=float, out_sharding=None):
         del out_sharding  # of the signature of JAX's initializers
-        return jax.random.uniform(key, shape, dtype, -bound, bound)
+        return jax.random.uniform(key, kernel_shape, dtype, -bound, bound)
 
     return draw
 
@@ -147,8 +147,8 @@ def mlp_policy(
     def apply(params, observation):
         outputs = jnp.asarray(network.apply(params["network"], observation))
         # The same for all observations, and parameters still: the gradient sums over the steps.
-        shape = (*outputs.shape[:-1], len(constants))
-        constant_outputs = jnp.broadcast_to(params["constants"], shape)
+        constants_shape = (*outputs.shape[:-1], len(constants))
+        constant_outputs = jnp.broadcast_to(params["constants"], constants_shape)
         return jnp.concatenate([outputs, constant_outputs], axis=-1)
 
     return Policy(init, apply, distribution)
@@ -194,8 +194,8 @@ class Actor(struct.PyTreeNode, kw_only=True):
     normalizer: normalize.Normalizer
 
     def __repr__(self) -> str:
-        count = sum(x.size for x in jax.tree.leaves(self.params))
-        return f"Actor({count:,} parameters, {self.normalizer!r})"
+        num_params = sum(x.size for x in jax.tree.leaves(self.params))
+        return f"Actor({num_params:,} parameters, {self.normalizer!r})"
 
 
 def act(policy: Policy, actor: Actor, observation: jax.Array) -> jax.Array:

@@ -19,7 +19,7 @@ from mjx_reinforce.learning.updates import Clock
 
 #: The standard deviation shrinks in so many steps. Each is far greater than float32's rounding of
 #: its logarithm, however many updates there are.
-_STEPS = 4096
+_NUM_STEPS = 4096
 
 
 class Cut(NamedTuple):
@@ -93,20 +93,20 @@ def share(clock: Clock, env_steps: float | jax.Array | None) -> jax.Array:
 
 
 def decay_rate(
-    least: float | jax.Array, env_steps: float | jax.Array | None = None
+    final_share: float | jax.Array, env_steps: float | jax.Array | None = None
 ) -> optax.GradientTransformationExtraArgs:
-    """Multiplies changes by a factor that falls linearly from 1 to ``least``, then stays.
+    """Multiplies changes by a factor that falls linearly from 1 to ``final_share``, then stays.
 
     Args:
-      least: the factor at the end.
+      final_share: the factor at the end.
       env_steps: over which it falls; None: over the budget.
     """
 
     def update(updates, state, params=None, **rollout: Any):
         del params
         # From the clock at the rollout's start: all steps of an update have the same rate.
-        factor = 1 + (least - 1) * share(rollout["clock"], env_steps)
-        return jax.tree.map(lambda x: factor * x, updates), state
+        rate_factor = 1 + (final_share - 1) * share(rollout["clock"], env_steps)
+        return jax.tree.map(lambda x: rate_factor * x, updates), state
 
     return optax.GradientTransformationExtraArgs(lambda params: optax.EmptyState(), update)
 
@@ -130,9 +130,9 @@ def shrink_std(
         del params
         # Optax adds updates to parameters, so the log of the std moves by the difference between
         # what is due and what was made so far; learning's own changes of it stay.
-        due_share = jnp.floor(share(rollout["clock"], env_steps) * _STEPS) / _STEPS
-        change = (due_share - state.share) * jnp.log(ratio)
-        return updates | {"constants": updates["constants"] + change}, Shrunk(due_share)
+        scheduled_share = jnp.floor(share(rollout["clock"], env_steps) * _NUM_STEPS) / _NUM_STEPS
+        log_change = (scheduled_share - state.share) * jnp.log(ratio)
+        return updates | {"constants": updates["constants"] + log_change}, Shrunk(scheduled_share)
 
     def init(params):
         del params

@@ -30,11 +30,15 @@ _MAX_TRIALS = 40
 
 
 def within_kl(
-    policy: Policy, before: Actor, after: Actor, visited: Visited, max_kl: float | jax.Array | None
+    policy: Policy,
+    old_actor: Actor,
+    new_actor: Actor,
+    visited: Visited,
+    max_kl: float | jax.Array | None,
 ) -> Actor:
-    """Returns the actor on the straight way from ``before`` to ``after`` that KL allows.
+    """Returns the actor on the straight way from ``old_actor`` to ``new_actor`` that KL allows.
 
-    A change whose KL(before || after), the mean over visited steps, is greater than ``max_kl`` is
+    A change whose KL(old || new), the mean over visited steps, is greater than ``max_kl`` is
     shortened as a whole, the parameters and the scale of the observations alike. KL grows as the
     square of a small change, so the first share that is tried is sqrt(max_kl / KL) (as in the
     natural gradient's step, Schulman et al. 2015, arXiv:1502.05477, appendix C). Where that goes
@@ -43,8 +47,8 @@ def within_kl(
 
     Args:
       policy: whose actor changes.
-      before: the actor that played.
-      after: the one that is proposed.
+      old_actor: the actor that played.
+      new_actor: the one that is proposed.
       visited: where the two are compared.
       max_kl: in nats; None limits nothing.
 
@@ -54,42 +58,44 @@ def within_kl(
       were not scaled so far, takes the first scale and nothing else.
     """
     if max_kl is None:
-        return after
-    old = act(policy, before, visited.observation)
+        return new_actor
+    old = act(policy, old_actor, visited.observation)
 
     def actor_at(share: jax.Array) -> Actor:
-        """Returns the actor after a share [] of the change, from 0, ``before``, to 1, ``after``."""
+        """Returns the actor after a share [] of the change: 0 ``old_actor``, 1 ``new_actor``."""
 
-        def blend(start: jax.Array, end: jax.Array) -> jax.Array:
-            return start + share * (end - start)
+        def blend(old_leaf: jax.Array, new_leaf: jax.Array) -> jax.Array:
+            return old_leaf + share * (new_leaf - old_leaf)
 
         return Actor(
-            params=jax.tree.map(blend, before.params, after.params),
+            params=jax.tree.map(blend, old_actor.params, new_actor.params),
             # Not by ``blend``: before the first observation the scale is 1, not that of zeros.
-            normalizer=normalize.between(before.normalizer, after.normalizer, share),
+            normalizer=normalize.between(old_actor.normalizer, new_actor.normalizer, share),
         )
 
     def kl_of(actor: Actor) -> jax.Array:
-        new = act(policy, actor, visited.observation)
-        kl = visited.mean(kl_divergence(policy.distribution, old, new, visited.action))
+        new_outputs = act(policy, actor, visited.observation)
+        kl = visited.mean(kl_divergence(policy.distribution, old, new_outputs, visited.action))
         return jnp.where(jnp.isfinite(kl), kl, jnp.inf)  # what overflows is beyond any limit
 
     # KL is near a square of the share, so this would fit where the change is small. An infinite KL
     # says nothing: then the search starts in the middle of its range, in the logarithm.
-    full_kl = kl_of(after)
+    full_kl = kl_of(new_actor)
     share = jnp.sqrt(max_kl / full_kl)
     share = jnp.where(share > _MIN_SHARE, share, _MIN_SHARE**0.5)
     first_share = jnp.where(full_kl <= max_kl, 1.0, share)
     share = _share_within(lambda share: kl_of(actor_at(share)), first_share, max_kl)
-    limited = actor_at(share)
+    limited_actor = actor_at(share)
 
     # The first scale also clips, which no share of it does less. It then comes alone and whole.
-    first_scale = jnp.isnan(share) & (before.normalizer.count == 0) & (after.normalizer.count > 0)
-    first_scale &= jnp.all(jnp.isfinite(ravel_pytree(after.params)[0]))
-    params = jax.tree.map(
-        lambda old, new: jnp.where(first_scale, old, new), before.params, limited.params
+    first_scale = (
+        jnp.isnan(share) & (old_actor.normalizer.count == 0) & (new_actor.normalizer.count > 0)
     )
-    return limited.replace(params=params)
+    first_scale &= jnp.all(jnp.isfinite(ravel_pytree(new_actor.params)[0]))
+    params = jax.tree.map(
+        lambda old, new: jnp.where(first_scale, old, new), old_actor.params, limited_actor.params
+    )
+    return limited_actor.replace(params=params)
 
 
 class _Search(NamedTuple):
@@ -121,26 +127,26 @@ def _share_within(
     """
 
     def fits(search: _Search) -> jax.Array:
-        fills = (search.kl >= _MIN_FILL * max_kl) & (search.kl <= _MAX_FILL * max_kl)
-        return fills | (search.share == 1.0)
+        is_filled = (search.kl >= _MIN_FILL * max_kl) & (search.kl <= _MAX_FILL * max_kl)
+        return is_filled | (search.share == 1.0)
 
     def unfinished(search: _Search) -> jax.Array:
         return ~fits(search) & (search.trials < _MAX_TRIALS)
 
     def body(search: _Search) -> _Search:
         """Tries a share between the greatest that fits and the least that does not."""
-        below = search.kl <= _MAX_FILL * max_kl
-        low = jnp.where(below, search.share, search.low)
-        high = jnp.where(below, search.high, search.share)
+        is_below = search.kl <= _MAX_FILL * max_kl
+        low = jnp.where(is_below, search.share, search.low)
+        high = jnp.where(is_below, search.high, search.share)
         # If KL were a square of the share, this share would hit the target. Where it is no square,
         # every second share halves what is left between low and high, in the logarithm.
-        square = search.share * jnp.sqrt(_TARGET_FILL * max_kl / search.kl)
-        usable = (square > low) & (square < high) & (search.trials % 2 == 1)
-        share = jnp.where(usable, square, jnp.sqrt(low) * jnp.sqrt(high))
+        root_share = search.share * jnp.sqrt(_TARGET_FILL * max_kl / search.kl)
+        is_usable = (root_share > low) & (root_share < high) & (search.trials % 2 == 1)
+        share = jnp.where(is_usable, root_share, jnp.sqrt(low) * jnp.sqrt(high))
         next_search = _Search(share, kl_at(share), low, high, search.trials + 1)
         # Vmapped over seeds, the loop goes on until the last one is done; the others stay.
-        active = unfinished(search)
-        return jax.tree.map(lambda new, old: jnp.where(active, new, old), next_search, search)
+        is_open = unfinished(search)
+        return jax.tree.map(lambda new, old: jnp.where(is_open, new, old), next_search, search)
 
     min_share = jnp.full_like(first_share, _MIN_SHARE)
     max_share = jnp.ones_like(first_share)

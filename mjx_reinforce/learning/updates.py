@@ -64,7 +64,7 @@ _NOISE_EPISODES = 64
 #: and what an update adds.
 Update = Callable[[Problem, jax.Array, Any, Any], tuple[Any, Any, dict[str, Any]]]
 #: (problem, key, params, gradient) -> what the optimizer is given for it; may consume the key.
-Turn = Callable[[Problem, jax.Array, Any, Any], Any]
+GradientMap = Callable[[Problem, jax.Array, Any, Any], Any]
 
 
 def full_batch() -> Update:
@@ -86,8 +86,8 @@ def full_batch() -> Update:
     return whole_rollout(lambda problem, key, params, gradient: gradient)
 
 
-def whole_rollout(turn: Turn) -> Update:
-    """``full_batch``, in which ``turn`` makes another step of the gradient."""
+def whole_rollout(gradient_map: GradientMap) -> Update:
+    """``full_batch``, in which ``gradient_map`` makes another step of the gradient."""
 
     def update(problem, key, params, opt_state):
         """Returns the parameters and the optimizer's state after one step, and its metrics."""
@@ -99,7 +99,7 @@ def whole_rollout(turn: Turn) -> Update:
         if mask.shape[1] > 1:
             metrics["gradient_snr"] = _signal_to_noise(problem, params, grads)
         metrics["entropy"] = sums["entropy"] / jnp.maximum(jnp.sum(mask), 1)
-        turn_gradient = functools.partial(turn, problem, key, params)
+        turn_gradient = functools.partial(gradient_map, problem, key, params)
         params, opt_state, step_metrics = descend(
             problem, grads, problem.divisor, params, opt_state, turn_gradient
         )
@@ -135,20 +135,22 @@ def descend(
     divisor: int | jax.Array,
     params: Params,
     opt_state: optax.OptState,
-    turn: Callable[[Any], Any] = lambda gradient: gradient,
+    gradient_map: Callable[[Any], Any] = lambda gradient: gradient,
 ) -> tuple[Any, Any, dict[str, jax.Array]]:
     """Makes one optimizer step on summed gradients; also returns the metrics of that step.
 
-    The optimizer is given what ``turn`` makes of the mean gradient.
+    The optimizer is given what ``gradient_map`` makes of the mean gradient.
     """
     grads = jax.tree.map(lambda g: g / divisor, grads)
-    # Of the gradient itself, before ``turn`` and the optimizer's clipping.
+    # Of the gradient itself, before ``gradient_map`` and the optimizer's clipping.
     norm = optax.tree.norm(grads)
     # Schedules read the clock; other optimizers of optax would not take it.
     optimizer = optax.with_extra_args_support(problem.optimizer)
-    changes, opt_state = optimizer.update(turn(grads), opt_state, params, clock=problem.clock)
+    change, opt_state = optimizer.update(
+        gradient_map(grads), opt_state, params, clock=problem.clock
+    )
     metrics = {"gradient_norm": norm}
-    return optax.apply_updates(params, changes), opt_state, metrics
+    return optax.apply_updates(params, change), opt_state, metrics
 
 
 def make_optimizer(
@@ -212,22 +214,24 @@ def signal_to_noise(mean: Params, episode_gradients: Params, num_episodes: int) 
       num_episodes: N, at least 2.
     """
     deviations = jax.tree.map(lambda g_m, g: g_m - g, episode_gradients, mean)
-    squares = jax.vmap(lambda tree: optax.tree.norm(tree, squared=True))(deviations)
+    squared_norms = jax.vmap(lambda deviation: optax.tree.norm(deviation, squared=True))(deviations)
     # The variance of the mean of N: that of one episode is N / (N - 1) times its mean square
     # deviation from the mean of N, and the mean's is 1 / N of it.
-    noise = jnp.mean(squares) / (num_episodes - 1)
+    noise = jnp.mean(squared_norms) / (num_episodes - 1)
     return optax.tree.norm(mean, squared=True) / noise - 1
 
 
 def accumulate_gradient(
-    loss: Callable[[Any, Any], tuple[jax.Array, Any]], params: Params, data: tuple[Any, ...]
+    loss: Callable[[Any, Any], tuple[jax.Array, Any]],
+    params: Params,
+    sample_arrays: tuple[Any, ...],
 ) -> tuple[jax.Array, Any, Any]:
     """Sums a loss, its gradient and its metrics over chunks of time.
 
     Args:
       loss: (params, chunk of data) -> (sum over the chunk, sums of metrics).
       params: what is differentiated.
-      data: arrays [T, N, ...]; the last is the mask [T, N], and time steps after
+      sample_arrays: arrays [T, N, ...]; the last is the mask [T, N], and time steps after
         the last one with any True are not visited.
 
     Returns:
@@ -237,29 +241,30 @@ def accumulate_gradient(
     differentiate = jax.value_and_grad(loss, has_aux=True)
 
     def visit(chunk):
-        (value, metrics), grads = differentiate(params, chunk)
-        return value, grads, metrics
+        (chunk_loss, metrics), grads = differentiate(params, chunk)
+        return chunk_loss, grads, metrics
 
-    return accumulate(visit, data)
+    return accumulate(visit, sample_arrays)
 
 
-def accumulate(function: Callable[[Any], Any], data: tuple[Any, ...]) -> Any:
+def accumulate(chunk_function: Callable[[Any], Any], sample_arrays: tuple[Any, ...]) -> Any:
     """Sums a function over chunks of time.
 
     Args:
-      function: chunk of data -> a pytree of sums over the chunk, of zeros where its mask is empty.
-      data: as for ``accumulate_gradient``.
+      chunk_function: chunk of data -> a pytree of sums over the chunk, of zeros where its mask
+        is empty.
+      sample_arrays: as for ``accumulate_gradient``.
     """
-    chunks, has_steps = in_chunks(data)
-    shapes = jax.eval_shape(function, chunk_at(chunks, jnp.zeros((), jnp.int32)))
+    chunks, has_steps = in_chunks(sample_arrays)
+    shapes = jax.eval_shape(chunk_function, chunk_at(chunks, jnp.zeros((), jnp.int32)))
 
     def body(carry):
         # A seed that is done adds zeros: its mask is empty in the chunks that others still visit.
         index, sums = carry
-        return index + 1, jax.tree.map(jnp.add, sums, function(chunk_at(chunks, index)))
+        return index + 1, jax.tree.map(jnp.add, sums, chunk_function(chunk_at(chunks, index)))
 
-    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    return while_any(while_needed(has_steps), body, (jnp.zeros((), jnp.int32), zeros))[1]
+    zero_sums = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return while_any(while_needed(has_steps), body, (jnp.zeros((), jnp.int32), zero_sums))[1]
 
 
 def draw_steps(key: jax.Array, mask: jax.Array, shape: tuple[int, ...]) -> jax.Array:
@@ -279,12 +284,14 @@ def draw_steps(key: jax.Array, mask: jax.Array, shape: tuple[int, ...]) -> jax.A
     return jnp.searchsorted(ranks, sampled_ranks)
 
 
-def in_chunks(data: tuple[Any, ...]) -> tuple[tuple[Any, ...], jax.Array]:
+def in_chunks(sample_arrays: tuple[Any, ...]) -> tuple[tuple[Any, ...], jax.Array]:
     """Returns the data [C, length, N, ...], and which of the C chunks have a step to visit."""
-    horizon, num_episodes = data[-1].shape
+    horizon, num_episodes = sample_arrays[-1].shape
     # It divides T, so that all chunks have one shape, as a loop needs it.
     length = chunk_length(horizon, num_episodes)
-    chunks = jax.tree.map(lambda x: x.reshape(horizon // length, length, *x.shape[1:]), data)
+    chunks = jax.tree.map(
+        lambda x: x.reshape(horizon // length, length, *x.shape[1:]), sample_arrays
+    )
     return chunks, jnp.any(chunks[-1], axis=(1, 2))
 
 

@@ -84,10 +84,10 @@ def value_baseline(
     """
     for name, count in (("horizon", horizon), ("num_fits", num_fits), ("batch_size", batch_size)):
         check_count(name, count)
-    to_go, network, fitter = _defaults(discount, network, optimizer)
+    returns_to_go, network, fitter = _defaults(discount, network, optimizer)
 
-    def value(params, observation, time):
-        time_share = jnp.asarray(time, observation.dtype) / horizon
+    def value(params, observation, step_index):
+        time_share = jnp.asarray(step_index, observation.dtype) / horizon
         inputs = jnp.concatenate([observation, time_share[..., None]], axis=-1)
         return jnp.asarray(network.apply(params, inputs))[..., 0]
 
@@ -103,25 +103,25 @@ def value_baseline(
         """Returns G - V [T, N] with V as it was, the critic fitted to G, and how good V was."""
         mask = trajectory.mask
         num_episodes = mask.shape[1]
-        returns = to_go.update((), trajectory)[0]
+        returns = returns_to_go.update((), trajectory)[0]
         # V of every step, before the fit: the weight must not depend on its own episode through V.
-        time = jnp.broadcast_to(jnp.arange(len(mask))[:, None], mask.shape)
-        data = (trajectory.observation, time, mask)
-        scaled = _map_steps(lambda chunk: value(critic.params, *chunk[:2]), data)
-        values = critic.mean + jnp.sqrt(critic.variance) * scaled
+        step_index = jnp.broadcast_to(jnp.arange(len(mask))[:, None], mask.shape)
+        step_arrays = (trajectory.observation, step_index, mask)
+        scaled_values = _map_steps(lambda chunk: value(critic.params, *chunk[:2]), step_arrays)
+        values = critic.mean + jnp.sqrt(critic.variance) * scaled_values
         weight, metrics = _residual(returns, values, mask)
 
         # The targets of the fit: G in standard deviations from its mean, this rollout's included.
         # Flat, [T * N, ...]: step t of episode n has the index t * N + n.
         updates, mean, variance = _moments(critic, returns, mask)
-        unit = jnp.where(variance > 0, jnp.sqrt(variance), 1.0)
+        return_unit = jnp.where(variance > 0, jnp.sqrt(variance), 1.0)
         draw_key = jax.random.fold_in(jax.random.key(critic.seed), critic.updates)
         observations = trajectory.observation.reshape(mask.size, -1)
-        targets = (returns.reshape(-1) - mean) / unit
+        targets = (returns.reshape(-1) - mean) / return_unit
 
         def squared_error(params, index):
-            predicted = value(params, observations[index], index // num_episodes)
-            return jnp.mean((predicted - targets[index]) ** 2)
+            predicted_value = value(params, observations[index], index // num_episodes)
+            return jnp.mean((predicted_value - targets[index]) ** 2)
 
         indices = draw_steps(draw_key, mask, (num_fits, batch_size))
         params, opt_state = _fit(
@@ -167,7 +167,7 @@ def full_batch_value_baseline(
       Estimator(of 1 episodes or more)
     """
     check_count("num_fits", num_fits)
-    to_go, network, fitter = _defaults(discount, network, optimizer)
+    returns_to_go, network, fitter = _defaults(discount, network, optimizer)
 
     def value(params, observation):
         return jnp.asarray(network.apply(params, observation))[..., 0]
@@ -182,19 +182,19 @@ def full_batch_value_baseline(
 
     def update(critic, trajectory):
         """Returns G - V [T, N] with V as it was, the critic fitted to G, and how good V was."""
-        returns = to_go.update((), trajectory)[0]
+        returns = returns_to_go.update((), trajectory)[0]
         mask = trajectory.mask
         # V before the fit: the weight must not depend on its own episode through V.
         values = value(critic.params, trajectory.observation)
         weight, metrics = _residual(returns, values, mask)
         steps = jnp.maximum(jnp.sum(mask), 1)
-        data = (trajectory.observation, returns, mask)
+        step_arrays = (trajectory.observation, returns, mask)
 
         def fit(critic, _):
-            _, grads, _ = accumulate_gradient(squared_error, critic.params, data)
+            _, grads, _ = accumulate_gradient(squared_error, critic.params, step_arrays)
             grads = jax.tree.map(lambda g: g / steps, grads)
-            changes, opt_state = fitter.update(grads, critic.opt_state, critic.params)
-            return FullBatchCritic(optax.apply_updates(critic.params, changes), opt_state), None
+            change, opt_state = fitter.update(grads, critic.opt_state, critic.params)
+            return FullBatchCritic(optax.apply_updates(critic.params, change), opt_state), None
 
         critic, _ = lax.scan(fit, critic, length=num_fits)
         return weight, critic, metrics
@@ -244,8 +244,8 @@ def _fit(
     def fit(carry, index):
         params, opt_state = carry
         grads = jax.grad(loss)(params, index)
-        changes, opt_state = optimizer.update(grads, opt_state, params)
-        return (optax.apply_updates(params, changes), opt_state), None
+        params_change, opt_state = optimizer.update(grads, opt_state, params)
+        return (optax.apply_updates(params, params_change), opt_state), None
 
     (params, opt_state), _ = lax.scan(fit, (params, opt_state), minibatches)
     return params, opt_state
@@ -256,33 +256,35 @@ def _residual(
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Returns the weights [T, N], and how good the values [T, N] were."""
     weight = jnp.where(mask, returns - values, 0.0)
-    error = jnp.sum(weight**2) / jnp.maximum(jnp.sum(mask), 1)
+    mean_squared_error = jnp.sum(weight**2) / jnp.maximum(jnp.sum(mask), 1)
     return weight, {
         "explained_variance": explained_variance(weight, returns, mask),
-        "value_loss": error,
+        "value_loss": mean_squared_error,
     }
 
 
-def _map_steps(function: Callable[[Any], jax.Array], data: tuple[Any, ...]) -> jax.Array:
+def _map_steps(
+    chunk_function: Callable[[Any], jax.Array], step_arrays: tuple[Any, ...]
+) -> jax.Array:
     """Applies a function of single steps to all of them; returns [T, N], 0 outside the mask.
 
     Args:
-      function: data [..., *] of any steps -> a number for each, [...].
-      data: as for ``accumulate_gradient``.
+      chunk_function: data [..., *] of any steps -> a number for each, [...].
+      step_arrays: as for ``accumulate_gradient``.
     """
-    chunks, has_steps = in_chunks(data)
+    chunks, has_steps = in_chunks(step_arrays)
 
     def body(carry):
         index, values = carry
         chunk = chunk_at(chunks, index)
-        chunk_values = jnp.where(chunk[-1], function(chunk), 0.0)
+        chunk_values = jnp.where(chunk[-1], chunk_function(chunk), 0.0)
         return index + 1, lax.dynamic_update_index_in_dim(values, chunk_values, index, 0)
 
     # Chunks without a step are not visited; their values stay 0.
-    shapes = jax.eval_shape(function, chunk_at(chunks, jnp.zeros((), jnp.int32)))
-    zeros = jnp.zeros((has_steps.size, *shapes.shape), shapes.dtype)
-    values = while_any(while_needed(has_steps), body, (jnp.zeros((), jnp.int32), zeros))[1]
-    return values.reshape(data[-1].shape)
+    shapes = jax.eval_shape(chunk_function, chunk_at(chunks, jnp.zeros((), jnp.int32)))
+    zero_values = jnp.zeros((has_steps.size, *shapes.shape), shapes.dtype)
+    values = while_any(while_needed(has_steps), body, (jnp.zeros((), jnp.int32), zero_values))[1]
+    return values.reshape(step_arrays[-1].shape)
 
 
 def _moments(
@@ -296,12 +298,12 @@ def _moments(
     updates = critic.updates + (steps > 0)
     divisor = jnp.maximum(updates.astype(jnp.uint32), 1)  # beyond 2^31 an int32 is negative
     # 1/k in update k is the plain mean of k updates; from the tenth on, a running mean.
-    share = jnp.where(steps > 0, jnp.maximum(1 / divisor, _UPDATE_SHARE), 0.0)
+    update_weight = jnp.where(steps > 0, jnp.maximum(1 / divisor, _UPDATE_SHARE), 0.0)
 
     def mean(x):
         return jnp.sum(jnp.where(mask, x, 0.0)) / jnp.maximum(steps, 1)
 
-    center = critic.mean + share * (mean(returns) - critic.mean)
+    center = critic.mean + update_weight * (mean(returns) - critic.mean)
     # About the running mean, not this rollout's, from which the values are measured.
-    spread = mean((returns - center) ** 2)
-    return updates, center, critic.variance + share * (spread - critic.variance)
+    update_variance = mean((returns - center) ** 2)
+    return updates, center, critic.variance + update_weight * (update_variance - critic.variance)

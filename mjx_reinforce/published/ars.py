@@ -149,20 +149,22 @@ class _Search:
         """``Learner.init``."""
         check_key(key)
         policy_key, key = jax.random.split(key)
-        size = base.observation_size(self.env)
-        return mr.TrainState(key=key, actor=first_actor(self.policy, size, policy_key))
+        observation_size = base.observation_size(self.env)
+        return mr.TrainState(key=key, actor=first_actor(self.policy, observation_size, policy_key))
 
     def play(self, state: mr.TrainState, key: jax.Array, active: bool | jax.Array = True) -> Trial:
         """``Learner.play``: draws the directions, and plays an episode each way along each."""
         directions_key, episodes_key = jax.random.split(key)
         # theta once for each direction, [D, ...], and a standard normal delta of that shape.
-        copies = jax.tree.map(
+        params_copies = jax.tree.map(
             lambda p: jnp.broadcast_to(p, (self.num_directions, *p.shape)), state.actor.params
         )
-        directions = optax.tree.random_like(directions_key, copies)
+        directions = optax.tree.random_like(directions_key, params_copies)
         # theta + nu delta and theta - nu delta, [2, D, ...].
-        moves = jax.tree.map(lambda d: self.noise_std * d, directions)
-        params_both_ways = jax.tree.map(lambda p, d: jnp.stack([p + d, p - d]), copies, moves)
+        params_moves = jax.tree.map(lambda d: self.noise_std * d, directions)
+        params_both_ways = jax.tree.map(
+            lambda p, d: jnp.stack([p + d, p - d]), params_copies, params_moves
+        )
 
         def play_one_way(params: Any, key: jax.Array) -> mr.Trajectory:
             """Returns [T, D] of D policies, an episode each, by their modes."""
@@ -197,25 +199,25 @@ class _Search:
         trajectory = trial.trajectory
         # r_plus and r_minus, [2, D].
         returns = replace_broken(episode_returns(trajectory), trajectory.nonfinite).reshape(2, -1)
-        step = self.increment(trial.directions, returns, self.noise_std)
-        params = jax.tree.map(lambda p, d: p + self.step_size * d, actor.params, step)
+        params_increment = self.increment(trial.directions, returns, self.noise_std)
+        params = jax.tree.map(lambda p, d: p + self.step_size * d, actor.params, params_increment)
         # V2 of the paper counts the states that all policies met, for the next update.
         sound_steps = trajectory.mask & ~trajectory.nonfinite
         normalizer = normalize.update(
             actor.normalizer,
             trajectory.observation,
             sound_steps,
-            at_most=self.normalize_steps,
+            max_count=self.normalize_steps,
             min_std=self.normalize_min_std,
         )
-        after = state.replace(actor=mr.Actor(params=params, normalizer=normalizer))
-        after, skipped = keep_finite(after, state)
+        next_state = state.replace(actor=mr.Actor(params=params, normalizer=normalizer))
+        next_state, num_skipped = keep_finite(next_state, state)
         measurements = {
             "entropy": jnp.zeros(()),
-            "gradient_norm": optax.tree.norm(step),
+            "gradient_norm": optax.tree.norm(params_increment),
             "return_std": jnp.std(returns),
         }
-        return after, update_metrics(trajectory, skipped, measurements)
+        return next_state, update_metrics(trajectory, num_skipped, measurements)
 
 
 def _join(trajectory: mr.Trajectory) -> mr.Trajectory:
@@ -239,8 +241,8 @@ def mean_difference(directions: Any, returns: jax.Array, noise_std: Any) -> Any:
     """Returns the sum in the module's formula over D sigma; zero where sigma is."""
     del noise_std
     gain = over_std(returns[0] - returns[1], returns) / returns.shape[1]
-    along = jax.vmap(optax.tree.scale)(gain, directions)
-    return jax.tree.map(lambda x: jnp.sum(x, axis=0), along)
+    weighted_directions = jax.vmap(optax.tree.scale)(gain, directions)
+    return jax.tree.map(lambda x: jnp.sum(x, axis=0), weighted_directions)
 
 
 def over_std(x: jax.Array, returns: jax.Array) -> jax.Array:

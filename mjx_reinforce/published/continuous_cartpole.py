@@ -84,8 +84,8 @@ def increment(directions: Any, returns: jax.Array, noise_std: Any) -> Any:
     all returns are equal it divides 0 by 0, and its parameters are NaN for good.
     """
     # [D]: what each direction adds up to over all entries of all parameters.
-    totals = sum(jnp.sum(d.reshape(len(d), -1), axis=1) for d in jax.tree.leaves(directions))
-    step = noise_std * jnp.sum(over_std(returns[0] - returns[1], returns) * totals)
+    sums = sum(jnp.sum(d.reshape(len(d), -1), axis=1) for d in jax.tree.leaves(directions))
+    step = noise_std * jnp.sum(over_std(returns[0] - returns[1], returns) * sums)
     return jax.tree.map(lambda d: jnp.full(d.shape[1:], step, d.dtype), directions)
 
 

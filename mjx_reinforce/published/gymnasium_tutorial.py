@@ -57,8 +57,8 @@ def with_one_start(learner: mr.Learner) -> mr.Learner:
     def play(state: mr.TrainState, key: jax.Array, active: Any = True, rollout: Any = None) -> Any:
         def from_one_start(env: Any, *policy: Any, **options: Any) -> mr.Trajectory:
             # The start key is in the state, not in ``env``: each seed of a vmap has its own.
-            any_start = learner.engine.rollout if rollout is None else rollout
-            return any_start(_OneStart(env, state.start_key), *policy, **options)
+            free_rollout = learner.engine.rollout if rollout is None else rollout
+            return free_rollout(_OneStart(env, state.start_key), *policy, **options)
 
         return learner.play(state, key, active, from_one_start)
 

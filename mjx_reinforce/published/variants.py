@@ -70,10 +70,10 @@ def normalized_returns(discount: float | jax.Array = 0.99) -> Estimator:
         """Returns G[t, n] in standard deviations from the mean of its episode, [T, N]."""
         mask = trajectory.mask
         returns = discounted_returns(trajectory.reward, discount)
-        centered = jnp.where(mask, returns - _episode_mean(returns, mask), 0.0)
+        centered_returns = jnp.where(mask, returns - _episode_mean(returns, mask), 0.0)
         # Over L - 1, as torch.std divides; an episode of one step is centered to 0 already.
-        variance = jnp.sum(centered**2, axis=0) / jnp.maximum(jnp.sum(mask, axis=0) - 1, 1)
-        normalized = centered / (jnp.sqrt(variance) + float(jnp.finfo(jnp.float32).eps))
+        variance = jnp.sum(centered_returns**2, axis=0) / jnp.maximum(jnp.sum(mask, axis=0) - 1, 1)
+        normalized = centered_returns / (jnp.sqrt(variance) + float(jnp.finfo(jnp.float32).eps))
         return replace_broken(normalized, trajectory.nonfinite)
 
     return stateless(weigh)
@@ -102,8 +102,8 @@ def minibatches(num_updates: int, batch_size: int) -> Update:
       >>> metrics["gradient_norm"].shape
       ()
     """
-    for name, value in (("num_updates", num_updates), ("batch_size", batch_size)):
-        check_count(name, value)
+    for name, whole_number in (("num_updates", num_updates), ("batch_size", batch_size)):
+        check_count(name, whole_number)
 
     def update(problem, key, params, opt_state):
         """Returns the parameters and the optimizer's state after all steps, and mean metrics."""
@@ -115,8 +115,8 @@ def minibatches(num_updates: int, batch_size: int) -> Update:
         def optimizer_step(carry, index):
             """One step on the minibatch ``index`` [batch_size]."""
             params, opt_state = carry
-            batch = jax.tree.map(lambda x: x[index], samples)
-            grads, sums = jax.grad(problem.surrogate, has_aux=True)(params, batch)
+            minibatch = jax.tree.map(lambda x: x[index], samples)
+            grads, sums = jax.grad(problem.surrogate, has_aux=True)(params, minibatch)
             params, opt_state, metrics = descend(problem, grads, batch_size, params, opt_state)
             return (params, opt_state), metrics | {"entropy": sums["entropy"] / batch_size}
 
@@ -161,9 +161,9 @@ def each_step() -> Update:
         def body(carry):
             t, params, opt_state, sums = carry
             params, opt_state, metrics = optimizer_step(t, params, opt_state)
-            after = t + 1, params, opt_state, jax.tree.map(jnp.add, sums, metrics)
+            step = t + 1, params, opt_state, jax.tree.map(jnp.add, sums, metrics)
             # Vmapped over seeds, the loop goes on until the seed with the longest episode is done.
-            return jax.tree.map(lambda new, old: jnp.where(has_next(carry), new, old), after, carry)
+            return jax.tree.map(lambda new, old: jnp.where(has_next(carry), new, old), step, carry)
 
         start = jnp.zeros((), jnp.int32)
         shapes = jax.eval_shape(optimizer_step, start, params, opt_state)[2]
@@ -184,8 +184,8 @@ def per_step(update: Update) -> Update:
     """
 
     def mean_update(problem, key, params, opt_state):
-        steps = jnp.maximum(jnp.sum(problem.samples[-1]), 1)
-        return update(problem._replace(divisor=steps), key, params, opt_state)
+        num_steps = jnp.maximum(jnp.sum(problem.samples[-1]), 1)
+        return update(problem._replace(divisor=num_steps), key, params, opt_state)
 
     return mean_update
 
@@ -205,7 +205,7 @@ def deterministic(
       [2.0]
     """
     del initial_std
-    layout = gaussian_outputs("deterministic", space, "parameter", 1.0, rescale)
+    gaussian = gaussian_outputs("deterministic", space, "parameter", 1.0, rescale)
 
     # There is no density to speak of: the error comes when a learner that needs one is built.
     def log_prob(outputs, action):
@@ -214,11 +214,11 @@ def deterministic(
         )
 
     return Distribution(
-        num_outputs=layout.size,
+        num_outputs=gaussian.size,
         constants=(),
         noise=lambda key, shape: jnp.zeros((*shape, 1)),
-        sample=lambda outputs, noise: layout.mean(outputs),
-        mode=layout.mean,
+        sample=lambda outputs, noise: gaussian.mean(outputs),
+        mode=gaussian.mean,
         log_prob=log_prob,
         entropy=lambda outputs: jnp.zeros(outputs.shape[:-1], outputs.dtype),
     )

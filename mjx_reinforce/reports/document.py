@@ -25,18 +25,18 @@ _TEMPLATES = resources.files("mjx_reinforce.reports") / "files"
 
 def draw_charts(findings: Findings) -> list[charts.Chart]:
     """Returns the charts that show something, numbered; those of all settings as one."""
-    numbered: list[charts.Chart] = []
+    numbered_charts: list[charts.Chart] = []
     number = 1
     for module in _CHARTS:
-        shown = [
+        filled_charts = [
             chart
             for chart in module.draw(findings)
             if any(table["configuration"] for table in chart.data.values())
         ]
-        numbered += [chart._replace(number=number) for chart in shown]
+        numbered_charts += [chart._replace(number=number) for chart in filled_charts]
         # A kind without charts leaves no gap in the numbers; one with several is one figure.
-        number += bool(shown)
-    return numbered
+        number += bool(filled_charts)
+    return numbered_charts
 
 
 def render(
@@ -114,30 +114,30 @@ def _text(findings: Findings, drawn: list[charts.Chart]) -> dict[str, Any]:
     """Returns the text of the page, without the provenance of its numbers."""
     figures = {figure.name: figure for figure in drawn}
     sensitivity = [figure for figure in drawn if figure.name.startswith("sensitivity-")]
-    listed = listings(findings)
+    tables = listings(findings)
     # A chart that shows nothing is None, so that the template can ask for it.
-    names = ("final", "curves", "solved", "distribution")
+    chart_names = ("final", "curves", "solved", "distribution")
     failures = any(not math.isfinite(x) for result in findings.results for x in result.final)
     return {
         "answer": words.headline(findings),
         "distrust": list(words.caveats(findings)),
-        "figures": {name: figures.get(name) for name in names},
+        "figures": {name: figures.get(name) for name in chart_names},
         "failures": failures,
         "several": len(findings.results) > 1,
         "few": not all(enough(len(result.final)) for result in findings.results),
         "solved": findings.experiment.threshold is not None and words.solved(findings.experiment),
         "two_ways": words.two_ways(findings),
         "pairs": counted(len(findings.comparisons), "pair"),
-        "listed": listed,
+        "listed": tables,
         "until": steps(findings.until),
-        "numbers": {name: place for place, name in enumerate(listed, start=1)},
+        "numbers": {name: place for place, name in enumerate(tables, start=1)},
         "sensitivity": sensitivity,
         "compared": COMPARED,
     }
 
 
 #: What the name of an entry of the provenance would not tell.
-_NAMES = {"git_commit": "last commit of the package's files"}
+_ENTRY_NAMES = {"git_commit": "last commit of the package's files"}
 
 
 def provenance_rows(experiment: Experiment) -> dict[str, Any]:
@@ -150,7 +150,7 @@ def provenance_rows(experiment: Experiment) -> dict[str, Any]:
         for name, seconds in experiment.timings.items()
     ]
     facts += [
-        (_NAMES.get(name) or setting_in_words(name), _in_words(value))
+        (_ENTRY_NAMES.get(name) or setting_in_words(name), _in_words(value))
         for name, value in experiment.provenance.items()
         if value not in (None, "", [])
     ]

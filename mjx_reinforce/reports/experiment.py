@@ -101,7 +101,7 @@ def lengthened(curves: np.ndarray, length: int) -> np.ndarray:
 def ordered(values: Sequence[Any]) -> list[Any]:
     """Returns the different values of a setting: numbers by size, others as they come."""
     # By ``repr``: lists cannot be keys of a dict, and True would be the key 1.
-    different = list({repr(value): value for value in values}.values())
-    if all(isinstance(value, int | float) for value in different):
-        return sorted(different)
-    return different
+    distinct_values = list({repr(value): value for value in values}.values())
+    if all(isinstance(value, int | float) for value in distinct_values):
+        return sorted(distinct_values)
+    return distinct_values

@@ -116,21 +116,21 @@ def compute_findings(experiment: Experiment) -> Findings:
     grid = _curve_steps(parts, min(end for end in ends if end >= _SAME_BUDGET * max(ends)))
     finals = np.concatenate([part.eval_return[-1] for part in parts])
     # Of all configurations: a seed that failed is then as bad in one as in another.
-    worst = min(finals[np.isfinite(finals)], default=math.nan)
+    worst_return = min(finals[np.isfinite(finals)], default=math.nan)
     results = [
-        _result(part, grid, worst, _solving_of(part, experiment, min(ends)), min(ends))
+        _result(part, grid, worst_return, _solving_of(part, experiment, min(ends)), min(ends))
         for part in parts
     ]
     # From here on a configuration is known by its rank; ``order`` leads back to the sources.
     order = sorted(range(len(results)), key=lambda i: _rank(results[i]))
-    ranked = [results[i] for i in order]
+    ranked_results = [results[i] for i in order]
     return Findings(
         experiment,
-        results=ranked,
+        results=ranked_results,
         order=order,
         grid=grid,
-        comparisons=_compare_pairs(ranked[:COMPARED]),
-        speeds=compare_speeds(ranked[:COMPARED]),
+        comparisons=_compare_pairs(ranked_results[:COMPARED]),
+        speeds=compare_speeds(ranked_results[:COMPARED]),
         until=min(ends),
     )
 
@@ -142,18 +142,18 @@ def on_grid(grid: np.ndarray, steps: np.ndarray, returns: np.ndarray) -> np.ndar
     """
     curves = []
     for s in range(returns.shape[1]):
-        moved = np.diff(steps[:, s], prepend=-1) > 0  # a seed that stands still keeps its value
-        curves.append(np.interp(grid, steps[moved, s], returns[moved, s]))
+        has_moved = np.diff(steps[:, s], prepend=-1) > 0  # a seed that stands still keeps its value
+        curves.append(np.interp(grid, steps[has_moved, s], returns[has_moved, s]))
     return np.stack(curves, axis=1)
 
 
 def _curve_steps(parts: Sequence[Configuration], end: int) -> np.ndarray:
     """Returns env steps from 0 to the end: evenly, and with more at the start for a log axis."""
     # The first evaluation is that before training, at 0, and the second is the first to learn from.
-    first = min(int(part.env_steps[min(1, len(part.env_steps) - 1)].max()) for part in parts)
-    even = np.linspace(0, end, _GRID_POINTS - 12)
-    early = np.geomspace(max(first, 1), max(end, 2), 14)[:-1]
-    return np.unique(np.concatenate([even, early[early < end]]).round())
+    first_steps = min(int(part.env_steps[min(1, len(part.env_steps) - 1)].max()) for part in parts)
+    even_steps = np.linspace(0, end, _GRID_POINTS - 12)
+    early_steps = np.geomspace(max(first_steps, 1), max(end, 2), 14)[:-1]
+    return np.unique(np.concatenate([even_steps, early_steps[early_steps < end]]).round())
 
 
 def _result(
@@ -221,12 +221,12 @@ def _rank(result: Result) -> tuple[float, ...]:
 def _compare_pairs(results: Sequence[Result]) -> list[Comparison]:
     """Compares the scores of all pairs, on the seeds that all of them have."""
     seeds = [result.configuration.seed for result in results]
-    shared = functools.reduce(np.intersect1d, seeds)
-    if len(results) < 2 or len(shared) < 2:
+    shared_seeds = functools.reduce(np.intersect1d, seeds)
+    if len(results) < 2 or len(shared_seeds) < 2:
         return []
     # Seeds ascend in every source, so that the shared ones stand in one order.
     return compare_all(
-        [result.scores[np.isin(result.configuration.seed, shared)] for result in results]
+        [result.scores[np.isin(result.configuration.seed, shared_seeds)] for result in results]
     )
 
 

@@ -60,22 +60,22 @@ def _results_table(findings: Findings) -> Listing:
 
 def _speed_table(findings: Findings) -> Listing:
     """Returns the table of who learns faster: the fastest first, or who earned most on the way."""
-    compared = findings.results[:COMPARED]
+    results = findings.results[:COMPARED]
     header = ["", "configuration", "return while training"]
-    order = np.argsort([-result.area.value for result in compared], kind="stable").tolist()
+    order = np.argsort([-result.area.value for result in results], kind="stable").tolist()
     if findings.speeds:
         header += ["mean steps to solve", "log-rank p, Holm"]
-        order = by_speed(compared)
-    fastest = order[0]
+        order = by_speed(results)
+    fastest_index = order[0]
     rows = []
     for i in order:
-        result = compared[i]
+        result = results[i]
         cells = [_cell(result.area)]
         if findings.speeds and result.solving:
             # Tests are kept once a pair, the lower place first.
             p_value = "fastest"
-            if i != fastest:
-                p_value = short_p(findings.speeds[min(i, fastest), max(i, fastest)])
+            if i != fastest_index:
+                p_value = short_p(findings.speeds[min(i, fastest_index), max(i, fastest_index)])
             cells += [_cell(result.solving.mean, steps), (p_value, "")]
         rows.append(_row(result, cells))
     return {"header": header, "rows": rows}
@@ -109,9 +109,9 @@ def _worst(findings: Findings) -> Listing:
         best_return = float(np.fmax.reduce(part.eval_return[:, s]))
         cells = [str(int(part.seed[s])), number(float(result.final[s])), number(best_return)]
         if result.solving:
-            solved_at = "never"
+            solving_steps = "never"
             if result.solving.solved[s]:
-                solved_at = steps(float(result.solving.steps[s]))
-            cells.append(solved_at)
+                solving_steps = steps(float(result.solving.steps[s]))
+            cells.append(solving_steps)
         rows.append(_row(result, [(cell, "") for cell in cells]))
     return {"header": header, "rows": rows}

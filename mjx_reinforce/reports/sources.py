@@ -74,12 +74,12 @@ def read_experiment(paths: Sequence[Path]) -> Experiment:
     if not paths:
         raise ValueError("there is nothing to report on: name a run or a sweep directory")
     # Counted twice, the seeds of one directory would look like twice as many.
-    by_place: dict[Path, Path] = {}
+    path_of_folder: dict[Path, Path] = {}
     for path in map(Path, paths):
-        earlier = by_place.setdefault(path.resolve(), path)
-        if earlier is not path:
-            raise ValueError(f"{earlier} and {path} are one directory: name each source once")
-    sources = [read_directory(path) for path in by_place.values()]
+        earlier_path = path_of_folder.setdefault(path.resolve(), path)
+        if earlier_path is not path:
+            raise ValueError(f"{earlier_path} and {path} are one directory: name each source once")
+    sources = [read_directory(path) for path in path_of_folder.values()]
     envs = list(dict.fromkeys(source.env for source in sources))
     if len(envs) > 1:
         raise ValueError(
@@ -136,8 +136,8 @@ def _join_shares(sources: Sequence[Source]) -> list[Source]:
         # Equal settings without --seeds are a run repeated, which is a configuration of its own.
         if any(share.settings.get("seeds") for share in shares):
             configurations = zip(*(share.configurations for share in shares), strict=True)
-            whole = [_join_parts(parts) for parts in configurations]
-            shares = [shares[0]._replace(configurations=whole)]
+            joined_configurations = [_join_parts(parts) for parts in configurations]
+            shares = [shares[0]._replace(configurations=joined_configurations)]
         joined += shares
     return joined
 
@@ -174,16 +174,17 @@ def _join_parts(parts: Sequence[Configuration]) -> Configuration:
 def _told_apart(sources: Sequence[Source]) -> list[Configuration]:
     """Returns all configurations, each with a label of its own and the settings that differ."""
     pairs = [(source, part) for source in sources for part in source.configurations]
-    full = [source.settings | part.settings for source, part in pairs]
-    names = dict.fromkeys(name for settings in full for name in settings)
-    differ = [
+    full_settings = [source.settings | part.settings for source, part in pairs]
+    names = dict.fromkeys(name for settings in full_settings for name in settings)
+    varied_names = [
         name
         for name in names
-        if name not in _HOUSEKEEPING and len({repr(settings.get(name)) for settings in full}) > 1
+        if name not in _HOUSEKEEPING
+        and len({repr(settings.get(name)) for settings in full_settings}) > 1
     ]
     parts = []
-    for (source, part), settings in zip(pairs, full, strict=True):
-        differences = {name: settings.get(name) for name in differ}
+    for (source, part), settings in zip(pairs, full_settings, strict=True):
+        differences = {name: settings.get(name) for name in varied_names}
         label = settings_in_words(differences)
         if not label:
             # A run by itself is its task; several of one task are told by their directories.
@@ -202,19 +203,19 @@ def _told_apart(sources: Sequence[Source]) -> list[Configuration]:
 def _in_common(sources: Sequence[Source]) -> dict[str, Any]:
     """Returns the settings that all configurations of all sources share."""
     swept = {name for source in sources for part in source.configurations for name in part.settings}
-    shared = {
+    shared_settings = {
         name: value
         for name, value in sources[0].settings.items()
         if name not in (*_HOUSEKEEPING, *swept)
         and all(name in x.settings and x.settings[name] == value for x in sources[1:])
     }
     # NAME=VALUE each; a sweep over one of them is over "env_set.NAME".
-    assignments = shared.get("env_set")
+    assignments = shared_settings.get("env_set")
     if assignments:
-        shared["env_set"] = [
+        shared_settings["env_set"] = [
             text for text in assignments if f"env_set.{text.partition('=')[0]}" not in swept
         ]
-    return shared
+    return shared_settings
 
 
 def _merge_provenance(sources: Sequence[Source]) -> tuple[dict[str, Any], list[str]]:
@@ -222,19 +223,19 @@ def _merge_provenance(sources: Sequence[Source]) -> tuple[dict[str, Any], list[s
 
     An entry in which they differ holds the answer of each directory.
     """
-    names = dict.fromkeys(name for source in sources for name in source.provenance)
-    merged = {}
+    entry_names = dict.fromkeys(name for source in sources for name in source.provenance)
+    provenance = {}
     disagree = []
-    for name in names:
+    for name in entry_names:
         answers = {str(s.directory): s.provenance.get(name) for s in sources}
         if len({repr(answer) for answer in answers.values()}) == 1:
-            merged[name] = sources[0].provenance.get(name)
+            provenance[name] = sources[0].provenance.get(name)
             continue
-        merged[name] = answers
+        provenance[name] = answers
         # Two commands are no reason for distrust, but two devices are.
         if name in _COMPARABLE:
             disagree.append(name)
-    return merged, disagree
+    return provenance, disagree
 
 
 def _path_in_words(path: Path | str) -> str:
@@ -325,7 +326,7 @@ def _outcome(content: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "threshold": numbers.pop("threshold", None),
         "timings": numbers,
-        "status": content.get("status", "finished"),
+        "status": content["status"],
     }
 
 

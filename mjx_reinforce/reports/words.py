@@ -126,12 +126,12 @@ def _ahead(findings: Findings) -> Iterator[str]:
     pairs = of_best(findings)
     if not pairs:
         return
-    next_best = pairs[0]
-    difference = float(next_best.difference.value)
+    second_pair = pairs[0]
+    difference = float(second_pair.difference.value)
     relation = f"is {number(difference)} above" if difference else "equals"
     yield (
-        f"The mean {relation} that of the next, {findings.labels[next_best.second]} "
-        f"({within(next_best.difference)}; {p_value(next_best.adjusted)} by the paired t-test, "
+        f"The mean {relation} that of the next, {findings.labels[second_pair.second]} "
+        f"({within(second_pair.difference)}; {p_value(second_pair.adjusted)} by the paired t-test, "
         f"after Holm's correction for {counted(len(findings.comparisons), 'pair')})."
     )
     ties = _ties(findings)
@@ -149,10 +149,10 @@ def _why_a_tie(findings: Findings, ties: list[Comparison]) -> str:
     # The least p value that so many seeds can have, all of one sign, times Holm's first factor.
     if len(findings.comparisons) * 2.0 ** (1 - num_seeds) >= LEVEL:
         reason = f"{counted(num_seeds, 'seed')} are too few to tell"
-    least = p_value(min(pair.adjusted for pair in ties))
-    if least != "p = 1":
-        least += " or more"
-    return f"{reason} ({least})"
+    least_p = p_value(min(pair.adjusted for pair in ties))
+    if least_p != "p = 1":
+        least_p += " or more"
+    return f"{reason} ({least_p})"
 
 
 def _listed(names: list[str]) -> str:
@@ -229,16 +229,16 @@ def _speed(findings: Findings) -> str:
         return ""
     labels = findings.labels[:COMPARED]
     fastest = by_speed(findings.results[:COMPARED])[0]
-    slower = [
+    slower_labels = [
         labels[sum(pair) - fastest]  # the other place of the pair
         for pair, p in findings.speeds.items()
         if fastest in pair and p < LEVEL
     ]
-    if not slower:
+    if not slower_labels:
         return ""
-    if len(slower) == len(labels) - 1:
+    if len(slower_labels) == len(labels) - 1:
         return f"The fastest is {labels[fastest]}"
-    return f"{labels[fastest]} is surely faster than {_listed(slower)}"
+    return f"{labels[fastest]} is surely faster than {_listed(slower_labels)}"
 
 
 def caveats(findings: Findings) -> Iterator[str]:
@@ -256,14 +256,14 @@ def caveats(findings: Findings) -> Iterator[str]:
             "intervals hold the truth less than 95% of the time. Below six, there are none."
         )
     # Of the configurations with an interval: how often it misses a group of three in ten.
-    fewest = min(filter(enough, sizes), default=_FEW_SEEDS)
-    unseen = (1 - _GROUP) ** fewest
-    if unseen > _RARE:
+    min_seeds = min(filter(enough, sizes), default=_FEW_SEEDS)
+    miss_probability = (1 - _GROUP) ** min_seeds
+    if miss_probability > _RARE:
         yield (
             "Where returns fall in two groups far apart, an interval of so few seeds does not keep "
-            f"its 95%: if three seeds in ten are of the other group, {fewest} seeds show none of "
-            f"them {percent(unseen)} of the time, so the interval of the mean holds the truth at "
-            f"most {percent(1 - unseen)} of the time."
+            f"its 95%: if three seeds in ten are of the other group, {min_seeds} seeds show none "
+            f"of them {percent(miss_probability)} of the time, so the interval of the mean holds "
+            f"the truth at most {percent(1 - miss_probability)} of the time."
         )
     num_failures = sum(int(np.sum(~np.isfinite(result.final))) for result in results)
     if num_failures:
@@ -300,9 +300,9 @@ def _edges(findings: Findings) -> Iterator[str]:
     """Yields the settings of the best that are the least or the greatest of three numbers."""
     for name, best in findings.results[0].configuration.settings.items():
         values = ordered([result.configuration.settings.get(name) for result in findings.results])
-        numbers = all(isinstance(x, int | float) and not isinstance(x, bool) for x in values)
+        is_numeric = all(isinstance(x, int | float) and not isinstance(x, bool) for x in values)
         # Of two values, either is at an edge.
-        if numbers and len(values) > 2 and best in (values[0], values[-1]):
+        if is_numeric and len(values) > 2 and best in (values[0], values[-1]):
             edge = "least" if best == values[0] else "greatest"
             label = setting_in_words(name).capitalize()
             yield f"{label} {say(best)} is the {edge} tried: try beyond it."
@@ -313,8 +313,8 @@ def _rises(band: Estimate) -> bool:
     points = np.flatnonzero(np.isfinite(band.value))
     if len(points) < 5:
         return False
-    before = points[int(0.85 * (len(points) - 1))]
-    last = points[-1]
-    rise = band.value[last] - band.value[before]
+    start = points[int(0.85 * (len(points) - 1))]
+    end = points[-1]
+    rise = band.value[end] - band.value[start]
     # Intervals that lie apart may be ever so narrow: a rise of less than a percent is none.
-    return bool(band.low[last] > band.high[before] and rise > 0.01 * np.ptp(band.value[points]))
+    return bool(band.low[end] > band.high[start] and rise > 0.01 * np.ptp(band.value[points]))

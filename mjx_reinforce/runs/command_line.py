@@ -46,7 +46,7 @@ _SWEEP = (
     "configuration is seed 3 of train with these settings, up to rounding."
 )
 #: Command -> (its description, its settings: dataclasses under their titles).
-_PROGRAMS: dict[str, tuple[str, dict[str, type]]] = {
+_COMMANDS: dict[str, tuple[str, dict[str, type]]] = {
     "train": (_TRAIN, GROUPS),
     "sweep": (_SWEEP, {"sweep": SweepSettings, **GROUPS}),
 }
@@ -72,23 +72,23 @@ def parse(arguments: Sequence[str], name: str = "train") -> Design:
             "run ends; leave one out"
         )
     if base.resume is None:
-        over = read_over(sweep.over)
+        swept = read_over(sweep.over)
         if name == "sweep":
-            check_swept(over)
+            check_swept(swept)
         return Design(
-            base=base, default=default, over=over, exact=sweep.exact, chunk_runs=sweep.chunk_runs
+            base=base, default=default, over=swept, exact=sweep.exact, chunk_runs=sweep.chunk_runs
         )
     directory = base.resume
     design = read_design(directory)
     # The flags are read again, now with the saved settings as defaults: a setting that no flag
     # names must stay as it is, and the comparison below sees only what the user changes.
     base, sweep = _read(name, flags, design.base, prog)
-    over = read_over(sweep.over)
+    swept = read_over(sweep.over)
     # A sweep may be named by its --over again, which is how its user confirms code of their own.
-    as_before = over in ({}, design.over) and sweep == SweepSettings(over=sweep.over)
-    if not as_before or (design.is_sweep and base != design.base):
+    is_unchanged = swept in ({}, design.over) and sweep == SweepSettings(over=sweep.over)
+    if not is_unchanged or (design.is_sweep and base != design.base):
         raise ValueError(f"what is in {directory} goes on as it is: give --resume alone")
-    if not over and any(is_own(x) for name in CODE for x in design.over.get(name, ())):
+    if not swept and any(is_own(x) for name in CODE for x in design.over.get(name, ())):
         raise ValueError(
             f"{directory} compares code of your own, and this would run that code; if you trust "
             "it, repeat the sweep's --over"
@@ -159,19 +159,21 @@ def _read(
       ValueError: see ``flags.read_command_line``; or the flags say by --seeds and by --num-seeds
         how many seeds there are.
     """
-    about, groups = _PROGRAMS[name]
-    defaults = vars(default)
+    about, groups = _COMMANDS[name]
+    default_values = vars(default)
     # A dataclass of dataclasses, one a group, whose titles become the headings of --help. The
     # fields of ``SweepSettings`` are not in a ``Config`` and keep their own defaults.
-    forms = []
+    group_fields = []
     for title, group in groups.items():
-        names = [field.name for field in fields(group) if field.name in defaults]
-        forms.append((title, group, group(**{name: defaults[name] for name in names})))
-    form = dataclasses.make_dataclass("Arguments", forms, frozen=True)
-    parsed = vars(read_command_line(form, arguments, prog, f"{about}\n\n{_names()}"))
-    values = {name: x for group in parsed.values() for name, x in vars(group).items()}
+        names = [field.name for field in fields(group) if field.name in default_values]
+        group_fields.append((title, group, group(**{name: default_values[name] for name in names})))
+    arguments_class = dataclasses.make_dataclass("Arguments", group_fields, frozen=True)
+    setting_groups = vars(
+        read_command_line(arguments_class, arguments, prog, f"{about}\n\n{_names()}")
+    )
+    values = {name: x for group in setting_groups.values() for name, x in vars(group).items()}
     # What is left over after this are the settings of the sweep, if it is one.
-    config = Config(**{name: values.pop(name) for name in defaults})
+    config = Config(**{name: values.pop(name) for name in default_values})
     if config.seeds is not None:
         if flag_value(arguments, "--num-seeds"):
             raise ValueError(
@@ -184,7 +186,7 @@ def _read(
 def _names() -> str:
     """Returns the presets and the tasks, for --help."""
     width = max(map(len, PRESETS))
-    presets = "\n".join(f"  {name:{width}}  {line}" for name, (line, _) in PRESETS.items())
+    presets = "\n".join(f"  {name:{width}}  {summary}" for name, (summary, _) in PRESETS.items())
     return (
         f"Presets, published programs whose settings replace the defaults:\n{presets}\n\n"
         f"Environments: {', '.join(envs.names())}."
@@ -234,9 +236,9 @@ def _train(name: str, interrupt: Interrupt) -> int:
     except ValueError as error:
         # The innermost frame tells who raised: this package refuses bad input by ValueError, but
         # one from a library, once training began, is a mistake of this program.
-        *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-        in_package = frame.f_globals.get("__name__", "").startswith("mjx_reinforce")
-        if outcome is None and interrupt.deferred() and not in_package:
+        *_, (stack_frame, _) = traceback.walk_tb(error.__traceback__)
+        is_own_code = stack_frame.f_globals.get("__name__", "").startswith("mjx_reinforce")
+        if outcome is None and interrupt.deferred() and not is_own_code:
             raise
         refuse(str(error))
     except (RuntimeError, MemoryError, OSError) as error:
@@ -255,27 +257,27 @@ def _refuse_full(error: RuntimeError | MemoryError | OSError, design: Design) ->
     So is refused a directory that is no longer there.
     """
     if isinstance(error, OSError):
-        missing = isinstance(error, FileNotFoundError) and not design.directory.is_dir()
-        if missing or isinstance(error, MovedError):
+        is_missing = isinstance(error, FileNotFoundError) and not design.directory.is_dir()
+        if is_missing or isinstance(error, MovedError):
             refuse(str(MovedError(design.directory)), status=1)
         remedy = "try again"
-        if any((design.directory / name).exists() for name in resume.BEGUN):
+        if any((design.directory / name).exists() for name in resume.FIRST_FILES):
             remedy = f"go on with --resume {design.directory}{code_flags(vars(design.base))}"
         # Errors of W&B have no number, and more room would not help.
-        room = "make room, then" if error.errno else "then"
-        files = f"the files of this {design.kind}"
-        refuse(f"cannot write {files} ({error}); {room} {remedy}", status=1)
+        room_advice = "make room, then" if error.errno else "then"
+        file_owner = f"the files of this {design.kind}"
+        refuse(f"cannot write {file_owner} ({error}); {room_advice} {remedy}", status=1)
     # JAX reports a full device as a RuntimeError with this status in its text.
     if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
         raise error
     if design.is_sweep:
-        subject = "a chunk"
+        batch_unit = "a chunk"
         flag = "--chunk-runs"
     else:
-        subject = "this run"
+        batch_unit = "this run"
         flag = "--num-seeds"
-    flags = f"{flag}, --num-episodes, --eval-episodes or --horizon"
-    refuse(f"{subject} does not fit into memory ({error}); lower {flags}")
+    memory_flags = f"{flag}, --num-episodes, --eval-episodes or --horizon"
+    refuse(f"{batch_unit} does not fit into memory ({error}); lower {memory_flags}")
 
 
 def refuse(message: str, status: int = 2) -> NoReturn:

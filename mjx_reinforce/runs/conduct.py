@@ -28,7 +28,7 @@ def conduct(
 
     Args:
       plan: what a run or a sweep is made of.
-      files: of it. A sweep always has some; a run has None if it is to leave nothing.
+      files: of the run or sweep. A sweep always has some; a run has None if it is to leave nothing.
       display: its screen.
       observers: who sees it, besides these.
       interrupt: what listens to signals.
@@ -52,16 +52,16 @@ def conduct(
     compiled_chunks = _first_compiled(unfinished_groups, plan)
     # Not before: a kill while it compiles leaves nothing that would refuse the next.
     interrupt.defer(display.say)
-    for file in own_files:
-        file.open()
+    for run_files in own_files:
+        run_files.open()
     display.start(clock.compiling)
     driver = None
-    for group_plan, runs, compiled in compiled_chunks:
+    for group_plan, runs, compiled_programs in compiled_chunks:
         driver = _begin(
             plan,
             group_plan,
             runs,
-            compiled,
+            compiled_programs,
             say=display.say,
             observers=all_observers,
             interrupted=interrupt.heard,
@@ -80,8 +80,8 @@ def conduct(
     else:
         assert isinstance(driver, RunDriver)
         # A signal after that changes nothing: what is left takes a second or two.
-        test = driver.test(interrupt.heard)
-        summary = driver.summary(plan.group_plans[0].ready.engine, clock.compiling, test)
+        test_metrics = driver.test(interrupt.heard)
+        summary = driver.summary(plan.group_plans[0].ready.engine, clock.compiling, test_metrics)
     for observer in all_observers:
         observer.finished(driver, summary)
     return driver, summary
@@ -91,7 +91,7 @@ def _unfinished(group_plans: Sequence[GroupPlan], own_files: Sequence[Files]) ->
     """Returns the groups of which some chunks have not ended yet, with these chunks alone."""
     unfinished_groups = []
     for group_plan in group_plans:
-        chunks = [x for x in group_plan.chunks if not any(file.has(x.name) for file in own_files)]
+        chunks = [x for x in group_plan.chunks if not any(files.has(x.name) for files in own_files)]
         if chunks:
             unfinished_groups.append(group_plan._replace(chunks=chunks))
     return unfinished_groups
@@ -101,7 +101,7 @@ def _begin(
     plan: Plan,
     group_plan: GroupPlan,
     runs: Runs,
-    compiled: Compiled,
+    compiled_programs: Compiled,
     *,
     say: Callable[[str], None],
     observers: Sequence[Observer[Any]],
@@ -113,7 +113,7 @@ def _begin(
       plan: of the run or the sweep.
       group_plan: of the chunk's group.
       runs: of the chunk.
-      compiled: the programs of the group.
+      compiled_programs: the programs of the group.
       say: shows a line to the user.
       observers: who sees the runs.
       interrupted: whether they are to end soon.
@@ -122,7 +122,7 @@ def _begin(
     # The number of seeds is here that of the chunk's runs, whatever configuration each is of.
     config = dataclasses.replace(group.config, num_seeds=len(runs.seed))
     settings = {name: values[runs.member] for name, values in group.settings.items()}
-    slots = Slots(compiled, runs.seed, settings)
+    slots = Slots(compiled_programs, runs.seed, settings)
     if plan.design.is_sweep:
         return Driver(config, slots, Record(config), runs, observers=observers)
     return begin_run(
@@ -163,16 +163,17 @@ def _compiled(
 ) -> Iterator[tuple[GroupPlan, Runs, Compiled]]:
     """Yields chunks with the programs of their group; those of the next compile meanwhile."""
     # A list with the task of the group that is next, or with none behind the last one.
-    tasks = [functools.partial(_compile, group_plan) for group_plan in group_plans[:1]]
-    for number, group_plan in enumerate(group_plans, start=1):
-        compiled = clock.wait(tasks.pop())
+    compilations = [functools.partial(_compile, group_plan) for group_plan in group_plans[:1]]
+    for group_number, group_plan in enumerate(group_plans, start=1):
+        compiled_programs = clock.wait(compilations.pop())
         # One group ahead, and not all: compiling takes memory and cores from what trains.
-        following = [
-            functools.partial(_compile, later) for later in group_plans[number : number + 1]
+        next_compilations = [
+            functools.partial(_compile, next_plan)
+            for next_plan in group_plans[group_number : group_number + 1]
         ]
-        tasks = [started(task).result for task in following]
+        compilations = [started(compilation).result for compilation in next_compilations]
         for runs in group_plan.chunks:
-            yield group_plan, runs, compiled
+            yield group_plan, runs, compiled_programs
 
 
 def _first_compiled(

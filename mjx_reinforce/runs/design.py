@@ -30,7 +30,7 @@ from mjx_reinforce.settings.groups import LogSettings
 from mjx_reinforce.training.resume import as_config, read_record, recordable
 
 #: What writing curves.npz and a report needs for a run with two evaluations (bytes).
-_RESULT = 760
+_RESULT_BYTES = 760
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -83,10 +83,10 @@ class Design:
     @functools.cached_property
     def directory(self) -> Path:
         """Where its files are; ``runs/<env>-<time>`` if nobody said."""
-        stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S-%f")[:-3]
+        time_stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S-%f")[:-3]
         # The id of a user's own task is module:Class, and some file systems refuse the colon.
-        by_default = Path("runs") / f"{self.base.env.replace(':', '.')}-{stamp}"
-        return self.base.resume or self.base.output or by_default
+        default_directory = Path("runs") / f"{self.base.env.replace(':', '.')}-{time_stamp}"
+        return self.base.resume or self.base.output or default_directory
 
     def count(self) -> int:
         """Returns how many configurations it has."""
@@ -95,8 +95,8 @@ class Design:
     @functools.cached_property
     def configurations(self) -> list[dict[str, Any]]:
         """The values of what is swept, in each configuration; the last changes fastest."""
-        every = itertools.product(*self.over.values())
-        return [dict(zip(self.over, values, strict=True)) for values in every]
+        combinations = itertools.product(*self.over.values())
+        return [dict(zip(self.over, combination, strict=True)) for combination in combinations]
 
     @functools.cached_property
     def configs(self) -> list[Config]:
@@ -106,8 +106,8 @@ class Design:
 
 def as_record(design: Design) -> dict[str, Any]:
     """Returns what sweep.json says of a design: all that decides its numbers."""
-    over = {name: list(values) for name, values in design.over.items()}
-    return {"settings": recordable(design.base), "over": over, "exact": design.exact}
+    swept_values = {name: list(setting_values) for name, setting_values in design.over.items()}
+    return {"settings": recordable(design.base), "over": swept_values, "exact": design.exact}
 
 
 def read_design(directory: Path) -> Design:
@@ -121,17 +121,17 @@ def read_design(directory: Path) -> Design:
     if "over" not in record:
         base = as_config(record, directory / "config.json")
         return Design(base=dataclasses.replace(base, resume=directory))
-    path = directory / "sweep.json"
-    with naming_damage(path):
+    record_path = directory / "sweep.json"
+    with naming_damage(record_path):
         settings = dict(record["settings"])
-        exact = record["exact"]
+        is_exact = record["exact"]
         # JSON has no tuples: a list among the values is one of layers, as ``read_over`` has it.
-        over = {
+        swept_values = {
             name: [tuple(x) if isinstance(x, list) else x for x in values]
             for name, values in record["over"].items()
         }
-    base = dataclasses.replace(as_config(settings, path), resume=directory)
-    return Design(base=base, over=over, exact=exact)
+    base = dataclasses.replace(as_config(settings, record_path), resume=directory)
+    return Design(base=base, over=swept_values, exact=is_exact)
 
 
 def check_design(design: Design) -> None:
@@ -144,15 +144,15 @@ def check_design(design: Design) -> None:
     check_each(design.base)
     # By the count alone: ``design.configs`` below would itself fill the memory.
     num_runs = design.count() * design.base.num_seeds
-    if num_runs * _RESULT > host_memory():
+    if num_runs * _RESULT_BYTES > host_memory():
         raise ValueError(
             f"the results of {num_runs:,} runs do not fit into memory: they need about "
-            f"{gigabytes(num_runs * _RESULT)}, {gigabytes(host_memory())} are here; lower "
+            f"{gigabytes(num_runs * _RESULT_BYTES)}, {gigabytes(host_memory())} are here; lower "
             "--num-seeds or the number of values after --over"
         )
-    for config, values in zip(design.configs, design.configurations, strict=True):
+    for config, configuration in zip(design.configs, design.configurations, strict=True):
         check(config)
-        check_read(config, values or design.chosen_names)
+        check_read(config, configuration or design.chosen_names)
     # In a sweep a setting may be of use to some configurations alone. Where none reads it, the
     # first one stands for all in the message.
     for name in set(design.chosen_names).difference(design.over):
@@ -170,15 +170,15 @@ def _check_sweep(design: Design) -> None:
     check_over(design.base, design.over)
 
 
-_FIELDS = {field.name: field for field in dataclasses.fields(Config)}
+_SETTINGS = {field.name: field for field in dataclasses.fields(Config)}
 #: What comes before the name of a setting of the environment, such as env_set.frame_skip.
-_ENV_SET = "env_set."
+_ENV_PREFIX = "env_set."
 #: Settings of an environment that all configurations of a sweep share, and why.
-_ENV_ONCE = {
+_SHARED_ENV_SETTINGS = {
     "max_episode_steps": "--over horizon says how long episodes are",
     "reward_threshold": "its report has one return that counts as solved",
 }
-_EXAMPLE = "such as --over learning-rate 1e-3 1e-2"
+_OVER_WORDS = "such as --over learning-rate 1e-3 1e-2"
 
 
 def read_over(flags: Sequence[Sequence[str]]) -> dict[str, list[Any]]:
@@ -190,41 +190,41 @@ def read_over(flags: Sequence[Sequence[str]]) -> dict[str, list[Any]]:
     Raises:
       ValueError: a setting does not exist or stands twice, or a value is not of its type.
     """
-    over: dict[str, list[Any]] = {}
+    swept_values: dict[str, list[Any]] = {}
     for words in flags:
         if not words:
-            raise ValueError(f"--over needs a setting and its values, {_EXAMPLE}")
+            raise ValueError(f"--over needs a setting and its values, {_OVER_WORDS}")
         name = words[0].removeprefix("--").replace("-", "_")
-        if name not in _FIELDS and not _of_env(name):
+        if name not in _SETTINGS and not _of_env(name):
             raise ValueError(_unknown(words[0].removeprefix("--")))
-        if name in over:
+        if name in swept_values:
             raise ValueError(f"--over {words[0]} is given twice: put all values behind one of them")
-        over[name] = [_value(name, word) for word in words[1:]]
-    return over
+        swept_values[name] = [_value(name, value_word) for value_word in words[1:]]
+    return swept_values
 
 
 def _of_env(name: str) -> str | None:
     """Returns the setting of the environment that a name after --over means, if it is one."""
-    setting = name.removeprefix(_ENV_SET)
+    setting = name.removeprefix(_ENV_PREFIX)
     return setting if setting != name and setting.isidentifier() else None
 
 
-def _unknown(word: str) -> str:
+def _unknown(setting_word: str) -> str:
     """Returns the message about a word that is no setting."""
     # The field's word for it is too far from our name to be found by spelling.
-    if word == "distribution":
-        near: str | None = "policy"
+    if setting_word == "distribution":
+        nearest_name: str | None = "policy"
     else:
-        near = nearest(word, [spoken(name) for name in _FIELDS])
-    hint = f" Did you mean {near!r}?" if near else ""
-    return f"unknown setting {word!r} after --over.{hint} (--help lists the settings.)"
+        nearest_name = nearest(setting_word, [spoken(name) for name in _SETTINGS])
+    hint = f" Did you mean {nearest_name!r}?" if nearest_name else ""
+    return f"unknown setting {setting_word!r} after --over.{hint} (--help lists the settings.)"
 
 
 def check_swept(over: Mapping[str, Sequence[Any]]) -> None:
     """Raises ValueError where a sweep goes over nothing."""
     if not over:
         raise ValueError(
-            f"nothing is swept: give --over a setting and its values, {_EXAMPLE}, or train one "
+            f"nothing is swept: give --over a setting and its values, {_OVER_WORDS}, or train one "
             f"configuration by {command('train')}"
         )
 
@@ -239,36 +239,36 @@ def check_over(base: Config, over: Mapping[str, Sequence[Any]]) -> None:
     for name, values in over.items():
         env_setting = _of_env(name)
         if env_setting:
-            reason = _ENV_ONCE.get(env_setting)
+            reason = _SHARED_ENV_SETTINGS.get(env_setting)
         else:
-            check_name("setting", name, _FIELDS)
-            reason = _FIELDS[name].metadata.get("once")
+            check_name("setting", name, _SETTINGS)
+            reason = _SETTINGS[name].metadata.get("once")
         if reason:
             raise ValueError(f"a sweep cannot go over {spoken(name)}: {reason}")
         if len(values) < 2:
             if not values:
-                remedy = f", {_EXAMPLE}"
+                remedy = f", {_OVER_WORDS}"
             elif env_setting:
                 remedy = f"; for one value pass --env-set {env_setting}={values[0]}"
             else:
                 remedy = f"; for one value pass {flag(name)}"
             raise ValueError(f"--over {spoken(name)} needs two values or more{remedy}")
         # Two equal configurations would have the same seeds, and so count each result twice.
-        repeated = [x for i, x in enumerate(values) if x in values[:i]]
-        if repeated:
-            raise ValueError(f"--over {spoken(name)} has the value {repeated[0]} twice")
+        repeats = [x for index, x in enumerate(values) if x in values[:index]]
+        if repeats:
+            raise ValueError(f"--over {spoken(name)} has the value {repeats[0]} twice")
 
 
-def _with_values(base: Config, values: Mapping[str, Any]) -> Config:
+def _with_values(base: Config, configuration: Mapping[str, Any]) -> Config:
     """Returns settings with other values, also of settings of the environment."""
-    fields = {}
+    config_values = {}
     env_words = {}
-    for name, value in values.items():
+    for name, value in configuration.items():
         if env_setting := _of_env(name):
             env_words[env_setting] = f"{env_setting}={value}"
         else:
-            fields[name] = value
-    config = dataclasses.replace(base, **fields)
+            config_values[name] = value
+    config = dataclasses.replace(base, **config_values)
     if not env_words:
         return config
     # The base may set what is swept, too, and an environment refuses a setting that stands twice.
@@ -276,17 +276,17 @@ def _with_values(base: Config, values: Mapping[str, Any]) -> Config:
     return dataclasses.replace(config, env_set=(*base_words, *env_words.values()))
 
 
-def _value(name: str, word: str) -> Any:
+def _value(name: str, value_word: str) -> Any:
     """Returns a word of the command line as a value of a setting's type.
 
     The environment reads its own settings.
     """
-    kind = (int | float | str) if _of_env(name) else _FIELDS[name].type
+    value_type = (int | float | str) if _of_env(name) else _SETTINGS[name].type
     with contextlib.suppress(ValueError):
-        return read_as(kind, word)
-    kind_in_words = spoken_kind(kind)
-    if get_origin(kind) is tuple:
-        kind_in_words = "layers, such as 32,32, or none"
-    elif "," in word:
-        kind_in_words += "; write spaces between values"
-    raise ValueError(f"--over {spoken(name)} has the value {word!r}, not {kind_in_words}")
+        return read_as(value_type, value_word)
+    type_in_words = spoken_kind(value_type)
+    if get_origin(value_type) is tuple:
+        type_in_words = "layers, such as 32,32, or none"
+    elif "," in value_word:
+        type_in_words += "; write spaces between values"
+    raise ValueError(f"--over {spoken(name)} has the value {value_word!r}, not {type_in_words}")

@@ -78,7 +78,7 @@ class Display(Observer[RunDriver]):
         """Leaves the last state on the screen."""
         self._bar.stop()
 
-    def say(self, text: str | Table, style: str | None = None, *, whole: bool = False) -> None:
+    def say(self, text: str | Table, style: str | None = None, *, is_whole: bool = False) -> None:
         """Prints a sentence or a table above the bar.
 
         A line that the screen does not take is lost: it may be a file on a full disk, or a pipe
@@ -87,11 +87,11 @@ class Display(Observer[RunDriver]):
         Args:
           text: is wrapped on a terminal, and a line elsewhere.
           style: one of rich's.
-          whole: wrap it nowhere: it is to be copied.
+          is_whole: wrap it nowhere: it is to be copied.
         """
         with suppress(OSError):
-            whole |= not self.console.is_terminal
-            self.console.print(text, style=style, highlight=False, soft_wrap=whole)
+            is_whole |= not self.console.is_terminal
+            self.console.print(text, style=style, highlight=False, soft_wrap=is_whole)
 
     def warn_of_model(self, instability: str | None) -> None:
         """Says that a model explodes in C MuJoCo, now and where its run is stopped."""
@@ -101,8 +101,8 @@ class Display(Observer[RunDriver]):
 
     def show_commands(self, commands: Mapping[str, str]) -> None:
         """Prints command lines after what they do; each is one line, to be copied."""
-        for purpose, line in commands.items():
-            self.say(f"{purpose}:  {line}", whole=True)
+        for purpose, command_line in commands.items():
+            self.say(f"{purpose}:  {command_line}", is_whole=True)
 
     def show_summary(
         self, summary: dict[str, Any], directory: Path, resume_flags: str = "", play_flags: str = ""
@@ -119,7 +119,7 @@ class Display(Observer[RunDriver]):
         # In commands that are to be copied the path is quoted for the shell, elsewhere as it is.
         quoted = shlex.quote(str(directory))
         if summary["status"] == "interrupted":
-            self.say(f"Interrupted: go on with --resume {quoted}{resume_flags}", whole=True)
+            self.say(f"Interrupted: go on with --resume {quoted}{resume_flags}", is_whole=True)
             return
         self.say(f"Files in {directory}; the picture is learning_curve.png.")
         self.show_commands(
@@ -157,11 +157,13 @@ class Display(Observer[RunDriver]):
                 f"{returns_and_speed}  {percent}  {time_left}".rstrip()
             )
 
-    def updated(self, driver: RunDriver, met: np.ndarray) -> None:
+    def updated(self, driver: RunDriver, num_nonfinite: np.ndarray) -> None:
         """Says once which seeds met numbers that are not finite; the last table counts them."""
-        if met.any() and not self._nonfinite_shown:
+        if num_nonfinite.any() and not self._nonfinite_shown:
             self._nonfinite_shown = True
-            text = record.describe_nonfinite(met, driver.config.first_seed, driver.updates())
+            text = record.describe_nonfinite(
+                num_nonfinite, driver.config.first_seed, driver.updates()
+            )
             self.say(text, "yellow")
 
     def evaluated(self, driver: RunDriver, evaluation: Evaluation, rows: Arrays) -> None:
@@ -191,26 +193,26 @@ class SweepScreen(Observer[Driver]):
         self._budgets_before += driver.record.used_up()
         runs = driver.runs
         configurations = self._plan.design.configurations
-        in_chunk = [configurations[number] for number in np.unique(runs.configuration)]
+        members = [configurations[number] for number in np.unique(runs.configuration)]
         settings = []
-        for name in in_chunk[0]:
+        for name in members[0]:
             # Each value once, in the order of the sweep; of many the ends are enough for a line.
-            values = [*dict.fromkeys(say(configuration[name]) for configuration in in_chunk)]
+            values = [*dict.fromkeys(say(configuration[name]) for configuration in members)]
             if len(values) >= 5:
                 values = [values[0], "...", values[-1]]
             settings.append(f"{setting_in_words(name)} {', '.join(values)}")
-        count = f"{counted(len(in_chunk), 'configuration')} of {len(configurations):,}"
-        self._display.say(f"{'; '.join(settings)} ({count}, {counted(len(runs.seed), 'run')})")
+        share = f"{counted(len(members), 'configuration')} of {len(configurations):,}"
+        self._display.say(f"{'; '.join(settings)} ({share}, {counted(len(runs.seed), 'run')})")
 
-    def updated(self, driver: Driver, met: np.ndarray) -> None:
+    def updated(self, driver: Driver, num_nonfinite: np.ndarray) -> None:
         """Shows how far it is."""
-        budgets = self._num_ended + driver.record.used_up()
-        fraction = float(budgets / self._num_runs)
+        num_budgets_used = self._num_ended + driver.record.used_up()
+        fraction = float(num_budgets_used / self._num_runs)
         # The time left is estimated from what this process trained: the time that earlier ones
         # took is in no clock of it.
-        gained = float(budgets - self._budgets_before) / self._num_runs
-        running = self._plan.clock.running()
-        progress = driver.record.progress_at(fraction, driver.seconds(), gained, running)
+        gain = float(num_budgets_used - self._budgets_before) / self._num_runs
+        seconds = self._plan.clock.running()
+        progress = driver.record.progress_at(fraction, driver.seconds(), gain, seconds)
         self._display.show_progress(progress)
 
     def ended(self, driver: Driver) -> None:
@@ -220,14 +222,14 @@ class SweepScreen(Observer[Driver]):
 
 def _returns_and_speed(progress: record.Progress) -> str:
     """Returns the returns and, after a block of updates, the mean speed."""
-    text = f"return {progress.iqm:7.1f}  worst {progress.worst:7.1f}"
+    progress_line = f"return {progress.iqm:7.1f}  worst {progress.worst:7.1f}"
     if progress.failed:
         seeds = f"{progress.failed:,} of {progress.num_seeds:,} seeds"
-        text = f"return {progress.iqm:7.1f}  worst nan ({seeds})"
+        progress_line = f"return {progress.iqm:7.1f}  worst nan ({seeds})"
     # NaN before the first block of updates.
     if not math.isnan(progress.env_steps_per_second):
-        text += f"  {progress.env_steps_per_second:,.0f} steps/s"
-    return text
+        progress_line += f"  {progress.env_steps_per_second:,.0f} steps/s"
+    return progress_line
 
 
 def _time_left(progress: record.Progress) -> str:
@@ -240,8 +242,8 @@ def _time_left(progress: record.Progress) -> str:
 def percent_done(fraction: float) -> str:
     """Returns a fraction as a percentage with one decimal, rounded down: 100% is all."""
     # As a decimal number: a float such as 0.29 is a little less, and would be rounded to 28.9%.
-    shown = Decimal(repr(fraction)).quantize(Decimal("0.001"), ROUND_DOWN)
-    return f"{100 * shown:.1f}%"
+    shown_fraction = Decimal(repr(fraction)).quantize(Decimal("0.001"), ROUND_DOWN)
+    return f"{100 * shown_fraction:.1f}%"
 
 
 def summary_table(summary: dict[str, Any]) -> Table:
@@ -259,28 +261,28 @@ def summary_table(summary: dict[str, Any]) -> Table:
     returns = np.array(summary["final_returns"])
     # ``min`` is NaN if a seed failed, which then is the worst; ``fmax`` passes over it.
     table.add_row("worst and best seed", f"{returns.min():.1f}, {np.fmax.reduce(returns):.1f}")
-    if failed := summary["seeds_nonfinite_at_end"]:
-        row = f"{failed:,} of {num_seeds}, worse than every other"
+    if num_failed := summary["seeds_nonfinite_at_end"]:
+        row = f"{num_failed:,} of {num_seeds}, worse than every other"
         table.add_row("seeds whose return is not finite", row)
-    if broken := sum(summary["nonfinite"]):
-        row = f"{broken:,}, of all seeds together"
+    if num_nonfinite := sum(summary["nonfinite"]):
+        row = f"{num_nonfinite:,}, of all seeds together"
         table.add_row("updates with values not finite", row)
-    if (at_end := summary["seeds_solved_at_end"]) is not None:
-        row = f"{at_end:,} of {num_seeds} at the end, {summary['seeds_ever_solved']:,} ever"
+    if (num_solved := summary["seeds_solved_at_end"]) is not None:
+        row = f"{num_solved:,} of {num_seeds} at the end, {summary['seeds_ever_solved']:,} ever"
         table.add_row(f"seeds at {summary['threshold']:,g}, the task's threshold", row)
-        solved = [count for count in summary["env_steps_to_solve"] if count is not None]
+        solved = [steps for steps in summary["env_steps_to_solve"] if steps is not None]
         if solved:
             table.add_row("env steps to solve", f"{min(solved):,} to {max(solved):,}")
     if "final_test_returns" in summary:
-        last = iqm(np.array(summary["final_test_returns"]))
-        best = iqm(np.array(summary["best_test_returns"]))
-        table.add_row("last policies on fresh starts", f"{last:.1f}")
+        last_iqm = iqm(np.array(summary["final_test_returns"]))
+        best_iqm = iqm(np.array(summary["best_test_returns"]))
+        table.add_row("last policies on fresh starts", f"{last_iqm:.1f}")
         # The best policies were chosen by their evaluations, so those flatter them.
-        luck = " (their evaluation was luck)" if best < last else ""
-        table.add_row("best policies on fresh starts", f"{best:.1f}{luck}")
+        luck_note = " (their evaluation was luck)" if best_iqm < last_iqm else ""
+        table.add_row("best policies on fresh starts", f"{best_iqm:.1f}{luck_note}")
     table.add_row("env steps per second", f"{summary['env_steps_per_second']:,.0f}")
-    useful = percent_done(summary["useful_step_fraction"])
-    table.add_row("steps of episodes, of all simulated", useful)
+    useful_percent = percent_done(summary["useful_step_fraction"])
+    table.add_row("steps of episodes, of all simulated", useful_percent)
     table.add_row("compiling", f"{summary['compile_seconds']:.1f} s")
     table.add_row("training and evaluating", f"{summary['run_seconds']:.1f} s")
     return table

@@ -35,19 +35,19 @@ if TYPE_CHECKING:
     from mjx_reinforce.training.driver import Driver, Observer
 
 #: What a kill leaves of the first file of a run or a sweep, which then was not begun.
-_FIRST = (".config.json.", ".sweep.json.")
+_FIRST_PREFIXES = (".config.json.", ".sweep.json.")
 #: What the system says where no room is left, on the disk or of what this user may have of it.
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 #: A disk with less room (bytes) is full: the files of a small run take about as much.
-_ROOM = 2**20
+_MIN_FREE_BYTES = 2**20
 
 
 def _make(directory: Path) -> None:
     """Makes the directory of a run, or raises OSError; ValueError if it is in that of another."""
     # Removing the outer run would remove this one, too.
-    if (outer := _run_around(directory)) is not None:
+    if (outer_run := _run_around(directory)) is not None:
         raise ValueError(
-            f"the run directory {directory} would be inside the run {outer}; choose another "
+            f"the run directory {directory} would be inside the run {outer_run}; choose another "
             "--output"
         )
     if directory.is_symlink():
@@ -58,7 +58,7 @@ def _make(directory: Path) -> None:
 def _check_unbegun(directory: Path) -> None:
     """Raises ValueError if anything was begun in a directory."""
     # Where a run was killed as it wrote its first file, nothing was.
-    if any(not path.name.startswith(_FIRST) for path in directory.iterdir()):
+    if any(not path.name.startswith(_FIRST_PREFIXES) for path in directory.iterdir()):
         raise ValueError(
             f"the run directory {directory} is not empty; choose another --output, or delete it"
         )
@@ -77,8 +77,8 @@ def _run_around(directory: Path) -> Path | None:
 
 def _try_to_write(directory: Path) -> None:
     """Writes a file that is gone at once, or raises OSError."""
-    with tempfile.TemporaryFile(dir=directory) as file:
-        file.write(bytes(_ROOM))
+    with tempfile.TemporaryFile(dir=directory) as trial_file:
+        trial_file.write(bytes(_MIN_FREE_BYTES))
 
 
 def remove_empty(folders: Sequence[Path]) -> None:
@@ -112,8 +112,8 @@ def own_directory(
     with contextlib.ExitStack() as stack:
         try:
             # The innermost comes first, as ``remove_empty`` needs it.
-            candidates = (directory, *directory.parents)
-            new_folders = [folder for folder in candidates if not folder.exists()]
+            locked_folders = (directory, *directory.parents)
+            new_folders = [folder for folder in locked_folders if not folder.exists()]
             if not resumed:
                 _make(directory)
             _try_to_write(directory)
@@ -122,11 +122,11 @@ def own_directory(
             # Under the lock: another process may have begun here a moment ago.
             if not resumed:
                 _check_unbegun(directory)
-            place = directory.stat()
+            directory_stat = directory.stat()
         except OSError as error:
             remove_empty(new_folders)
             remedy = "make it a folder that you may write to"
-            if error.errno in _FULL:
+            if error.errno in _FULL_ERRORS:
                 remedy = "make room there"
             if not resumed:
                 remedy += ", or choose another --output"
@@ -136,7 +136,7 @@ def own_directory(
         # A signal that ends the process runs no ``finally``.
         interrupt.on_exit(lambda: remove_empty(new_folders))
         try:
-            yield place
+            yield directory_stat
         finally:
             remove_empty(new_folders)
 
@@ -207,21 +207,23 @@ def perform(
     check_design(design)
     with contextlib.ExitStack() as stack:
         directory = None
-        place = None
+        directory_stat = None
         resumed = design.base.resume is not None
         if files:
             directory = design.directory
-            place = stack.enter_context(own_directory(directory, interrupt, resumed=resumed))
+            directory_stat = stack.enter_context(
+                own_directory(directory, interrupt, resumed=resumed)
+            )
         # Under the lock: the process that trains there would change it.
         saved_record = read_record(design.directory) if resumed else {}
         # Only sweep.json has a status: a finished run goes on with a larger budget.
         if saved_record.get("status") == "finished":
             return Outcome(design, directory, saved_record, None, {}, _display(quiet=quiet))
         # A module of the user's is imported before JAX starts, which it may set up.
-        first = design.configs[0]
+        first_config = design.configs[0]
         env = None
-        if not envs.is_ours(first.env):
-            env = envs.make_set(first.env, first.env_set)
+        if not envs.is_ours(first_config.env):
+            env = envs.make_set(first_config.env, first_config.env_set)
         # These imports load JAX and MJX, for seconds: bad input was refused before.
         try:
             configure_jax()
@@ -240,12 +242,12 @@ def perform(
         with display.console.status("writing the simulation out"):
             plan = make_plan(design, saved_record, env, display.say)
         display.say(describe(plan))
-        display.say(describe_compiling(first, design.over))
+        display.say(describe_compiling(first_config, design.over))
         with display:
             own_files = None
-            if directory is not None and place is not None:
-                # Writing the simulation out took its time, in which it may have been moved.
-                check_place(directory, place)
+            if directory is not None and directory_stat is not None:
+                # Writing the simulation out took its time, in which the folder may have been moved.
+                check_place(directory, directory_stat)
                 files_class = SweepFiles if design.is_sweep else RunFiles
                 own_files = files_class(directory, plan, display.say)
             driver, summary = conduct(plan, own_files, display, observers, interrupt)
@@ -269,8 +271,8 @@ def report_on(outcome: Outcome, *, report: bool = True) -> None:
     if not outcome.design.is_sweep:
         settings = vars(outcome.driver.config) if outcome.driver else {}
         # Playing a policy runs the code of these two only; going on runs that of all settings.
-        for_playing = {name: settings[name] for name in ("env", "policy") if name in settings}
-        display.show_summary(summary, directory, code_flags(settings), code_flags(for_playing))
+        player_settings = {name: settings[name] for name in ("env", "policy") if name in settings}
+        display.show_summary(summary, directory, code_flags(settings), code_flags(player_settings))
         return
     if summary["status"] == "interrupted":
         flags = code_flags(summary["settings"])
@@ -279,34 +281,34 @@ def report_on(outcome: Outcome, *, report: bool = True) -> None:
     if outcome.driver is None and (directory / "report.html").exists():
         display.say(f"the sweep in {directory} is finished")
         return
-    took = (
+    timing = (
         f"compiling took {summary['compile_seconds']:.1f} s, training and evaluating "
         f"{summary['run_seconds']:.1f} s"
     )
     if not report:
-        display.say(f"{took}. Files in {directory}")
+        display.say(f"{timing}. Files in {directory}")
         return
     display.say("writing the report")
     # The lock of training is gone by now, and --resume in another process would write here, too.
     with locked(directory):
-        written = _report(directory)
-    took += f", statistics and report {written.seconds:.1f} s"
-    for sentence in (*written.answer, f"{took}. Files in {directory}, first report.html"):
+        page = _report(directory)
+    timing += f", statistics and report {page.seconds:.1f} s"
+    for sentence in (*page.answer, f"{timing}. Files in {directory}, first report.html"):
         display.say(sentence)
-    display.show_commands(_watch_command(directory, written.best, summary["settings"]))
+    display.show_commands(_watch_command(directory, page.best, summary["settings"]))
 
 
 def _report(directory: Path) -> "WrittenReport":
     """Writes the report of a sweep; removes what a crash left of writing it."""
     from mjx_reinforce import report
 
-    for leftover in [*directory.glob(".report.html.*"), *(directory / "report").glob(".*")]:
-        leftover.unlink()
+    for temporary_path in [*directory.glob(".report.html.*"), *(directory / "report").glob(".*")]:
+        temporary_path.unlink()
     return report.write_report([directory], directory / "report.html")
 
 
 def _watch_command(directory: Path, number: int, settings: Mapping[str, Any]) -> dict[str, str]:
     """Returns the command that plays the best policy of a configuration, after what it does."""
-    place = shlex.quote(str(directory / "policies" / f"{number:03d}"))
+    policy_directory = shlex.quote(str(directory / "policies" / f"{number:03d}"))
     flags = code_flags({name: settings[name] for name in ("env", "policy")})
-    return {"To see the best of it play": f"{command('watch')} {place}{flags}"}
+    return {"To see the best of it play": f"{command('watch')} {policy_directory}{flags}"}

@@ -116,18 +116,18 @@ def make_plan(
     if config.resume is not None:
         checkpoint = resume.newest_checkpoint(config, say)
     division = divide_run(config)
-    ready = load_or_build_ready(config, design.default or config, env, division)
+    ready_programs = load_or_build_ready(config, design.default or config, env, division)
     actors = None
     # The policies of a checkpoint began with those of the other run, and have learned since.
     if config.init_from is not None and checkpoint is None:
-        actors = last_actors(config, ready.policy)
+        actors = last_actors(config, ready_programs.policy)
     # As config.json will say it: the run then goes on with this time limit, also in a later
     # version, where the task's own may be another.
-    config = dataclasses.replace(config, horizon=ready.horizon)
+    config = dataclasses.replace(config, horizon=ready_programs.horizon)
     group = Group(config, members=np.zeros(1, int), settings={})
     group_plan = GroupPlan(
         group=group,
-        ready=ready,
+        ready=ready_programs,
         limit=config.num_seeds,
         width=division.capacity(config.num_seeds),
         chunks=split_runs(group, "000", 1),
@@ -137,7 +137,7 @@ def make_plan(
 
 #: Episodes are divided among GPUs only where each plays so many of an update, of all seeds: fewer
 #: take as long as these. Devices of a CPU are there because the user made them.
-_LEAST = 1024
+_MIN_EPISODES = 1024
 #: XLA of this JAX ends the process on a CPU's devices as it divides arrays without entries, such as
 #: the constants of a categorical policy. Where whole seeds are divided it has none to divide.
 _DIVIDES_NO_EPISODES = "0.11.2"
@@ -152,22 +152,26 @@ def divide_run(config: Config) -> Division:
     num_devices = jax.local_device_count()
     num_seeds = config.num_seeds
     # Seeds a device, and from that the devices: of 5 seeds on 4 devices two each, on three.
-    width = -(-num_seeds // num_devices)
-    by_seeds = Division(seeds=-(-num_seeds // width))
-    on_cpu = jax.default_backend() == "cpu"
-    if on_cpu and jax.__version__ == _DIVIDES_NO_EPISODES:
-        return by_seeds
+    seeds_per_device = -(-num_seeds // num_devices)
+    seed_division = Division(seeds=-(-num_seeds // seeds_per_device))
+    is_cpu = jax.default_backend() == "cpu"
+    if is_cpu and jax.__version__ == _DIVIDES_NO_EPISODES:
+        return seed_division
     # Only the learners of this package that follow a gradient sum it over the devices.
     if find_algorithm(config.algorithm).search_episodes or is_own(config.algorithm):
-        return by_seeds
+        return seed_division
     # Every device plays as many episodes of an update.
-    episodes = max(n for n in range(1, num_devices + 1) if config.num_episodes % n == 0)
-    episodes_per_device = num_seeds * config.episodes_per_update / episodes
-    enough = episodes_per_device >= _LEAST or on_cpu
+    num_episode_devices = max(
+        device_count
+        for device_count in range(1, num_devices + 1)
+        if config.num_episodes % device_count == 0
+    )
+    episodes_per_device = num_seeds * config.episodes_per_update / num_episode_devices
+    has_enough_episodes = episodes_per_device >= _MIN_EPISODES or is_cpu
     # Both sides say how many seeds' episodes a device plays, and the lower one takes less time.
-    if enough and num_seeds / episodes < width:
-        return Division(episodes=episodes)
-    return by_seeds
+    if has_enough_episodes and num_seeds / num_episode_devices < seeds_per_device:
+        return Division(episodes=num_episode_devices)
+    return seed_division
 
 
 def _plan_sweep(
@@ -184,34 +188,36 @@ def _plan_sweep(
     """
     # A program for several devices need not round as the one for a single device does.
     division = Division(seeds=1 if design.exact else jax.local_device_count())
-    saved_count = saved_record.get("local_devices", division.count)
-    if saved_count != division.count:
+    num_saved_devices = saved_record.get("local_devices", division.count)
+    if num_saved_devices != division.count:
         raise ValueError(
-            f"{design.directory} was begun on {saved_count} devices, and here are "
+            f"{design.directory} was begun on {num_saved_devices} devices, and here are "
             f"{division.count}; go on with as many"
         )
     group_plans = []
-    for number, group in enumerate(make_groups(design)):
+    for group_number, group in enumerate(make_groups(design)):
         config = group.config
         # Refused is what the policy does not read and differs from the default. Here that is what
         # the user chose or sweeps, unless this configuration does not read it in any case.
         chosen_names = vars(config).keys() & {*design.chosen_names, *design.over}
-        unset = {name: None for name in chosen_names if is_read(name, config)}
-        default: Any = dataclasses.replace(config, **unset)
-        ready = load_or_build_ready(
+        unset_values = {name: None for name in chosen_names if is_read(name, config)}
+        default: Any = dataclasses.replace(config, **unset_values)
+        ready_programs = load_or_build_ready(
             config, default, division=division, traced=tuple(group.settings)
         )
         # A sweep that goes on has the chunks that it had, by whose names their files are found,
         # whatever memory there is here.
         if saved_record:
-            limit = saved_record["chunk_runs"][number]
+            max_chunk_runs = saved_record["chunk_runs"][group_number]
         elif design.chunk_runs is not None:
-            limit = min(design.chunk_runs, group.num_runs)
+            max_chunk_runs = min(design.chunk_runs, group.num_runs)
         else:
-            limit = min(max(_capacity(group, ready), division.count), group.num_runs)
-        num_chunks, width = divide(group, limit, division.count, exact=design.exact)
-        chunks = split_runs(group, f"{number:03d}", num_chunks)
-        group_plans.append(GroupPlan(group, ready, limit, width, chunks))
+            max_chunk_runs = min(
+                max(_capacity(group, ready_programs), division.count), group.num_runs
+            )
+        num_chunks, slot_width = divide(group, max_chunk_runs, division.count, exact=design.exact)
+        chunks = split_runs(group, f"{group_number:03d}", num_chunks)
+        group_plans.append(GroupPlan(group, ready_programs, max_chunk_runs, slot_width, chunks))
     return group_plans, division
 
 
@@ -221,20 +227,25 @@ def make_groups(design: Design) -> list[Group]:
     Where it is exact, every number is traced that may be, so that what is swept beside it changes
     no program.
     """
-    members: dict[Any, list[int]] = {}
+    numbers_of_programs: dict[Any, list[int]] = {}
     configs = design.configs
-    traced = [_traced(config, design.over, design.exact) for config in configs]
-    for number, (config, settings) in enumerate(zip(configs, traced, strict=True)):
+    traced_settings = [_traced(config, design.over, design.exact) for config in configs]
+    for number, (config, settings) in enumerate(zip(configs, traced_settings, strict=True)):
         # Two that differ in traced numbers alone are equal once these are taken out.
-        compiled = dataclasses.replace(config, **dict.fromkeys(settings, None))
-        members.setdefault((dataclasses.astuple(compiled), tuple(settings)), []).append(number)
+        compiled_config = dataclasses.replace(config, **dict.fromkeys(settings, None))
+        numbers_of_programs.setdefault(
+            (dataclasses.astuple(compiled_config), tuple(settings)), []
+        ).append(number)
     return [
         Group(
-            configs[numbers[0]],
-            np.array(numbers),
-            {name: np.array([traced[i][name] for i in numbers]) for name in traced[numbers[0]]},
+            configs[member_numbers[0]],
+            np.array(member_numbers),
+            {
+                name: np.array([traced_settings[member][name] for member in member_numbers])
+                for name in traced_settings[member_numbers[0]]
+            },
         )
-        for numbers in members.values()
+        for member_numbers in numbers_of_programs.values()
     ]
 
 
@@ -242,13 +253,15 @@ def _traced(config: Config, swept: Collection[str], exact: bool) -> dict[str, fl
     """Returns the numbers of a configuration that its programs take as arguments."""
     if is_own(config.algorithm):
         return {}
-    names = set(marked(Mark.TRACED))
+    traceable_names = set(marked(Mark.TRACED))
     for reader in (Reader.GRADIENT, Reader.REINFORCE):
-        names.difference_update(() if reader.holds(config) else marked(reader))
+        traceable_names.difference_update(() if reader.holds(config) else marked(reader))
     if not (Reader.REINFORCE.holds(config) and Reader.FREE_STD.holds(config)):
         # Others have ``initial_std`` in their actions, which an engine may compile.
-        names.discard("initial_std")
-    settings = {name: getattr(config, name) for name in sorted(names) if exact or name in swept}
+        traceable_names.discard("initial_std")
+    settings = {
+        name: getattr(config, name) for name in sorted(traceable_names) if exact or name in swept
+    }
     if not Reader.DECAY.holds(config):
         settings.pop("final_learning_rate", None)
     elif "learning_rate" in settings and config.final_learning_rate is None:
@@ -261,11 +274,11 @@ def _traced(config: Config, swept: Collection[str], exact: bool) -> dict[str, fl
 
 
 #: The states of a chunk take up to this part of the host's memory.
-_MEMORY = 0.6
+_MEMORY_SHARE = 0.6
 #: So many copies of the states are there at once.
-_COPIES = 5
+_NUM_COPIES = 5
 #: So few runs are one chunk whatever they take: to know that takes a second a group.
-_FEW = 256
+_MIN_CHUNK_RUNS = 256
 #: Episodes side by side in a slot of a CPU. On two cores a run costs the same beside 7 others or
 #: 255, and narrow slots waste less on runs of other lengths.
 _CPU_EPISODES = 128
@@ -273,24 +286,24 @@ _CPU_EPISODES = 128
 _GPU_EPISODES = 65_536
 
 
-def divide(group: Group, limit: int, num_devices: int, *, exact: bool) -> tuple[int, int]:
+def divide(group: Group, max_chunk_runs: int, num_devices: int, *, exact: bool) -> tuple[int, int]:
     """Returns ``num_chunks`` and the ``width`` of a part.
 
     Args:
       group: whose configurations have ``group.config.num_seeds`` runs each.
-      limit: runs in a chunk at most.
+      max_chunk_runs: runs in a chunk at most.
       num_devices: among which a chunk is divided.
       exact: one run a slot.
     """
-    num_chunks = -(-group.num_runs // limit)
+    num_chunks = -(-group.num_runs // max_chunk_runs)
     if exact:
         return num_chunks, num_devices
     # A slot is no wider than a device's share of a chunk, and has about as many episodes as are
     # played best at once. Both are rounded up.
-    share = -(-group.num_runs // (num_chunks * num_devices))
+    device_runs = -(-group.num_runs // (num_chunks * num_devices))
     slot_episodes = _CPU_EPISODES if jax.default_backend() == "cpu" else _GPU_EPISODES
     slot_runs = -(-slot_episodes // group.config.episodes_per_update)
-    return num_chunks, num_devices * min(share, slot_runs)
+    return num_chunks, num_devices * min(device_runs, slot_runs)
 
 
 def split_runs(group: Group, name: str, num_chunks: int) -> list[Runs]:
@@ -304,30 +317,37 @@ def split_runs(group: Group, name: str, num_chunks: int) -> list[Runs]:
       name: of the group, for the files.
       num_chunks: how many.
     """
-    total = group.num_runs
-    size = -(-total // num_chunks)
+    num_runs = group.num_runs
+    chunk_size = -(-num_runs // num_chunks)
     # Run i has seed i // C of configuration i % C, where the group has C configurations.
-    seed, place = np.divmod(np.arange(total), len(group.members))
+    seed, member_index = np.divmod(np.arange(num_runs), len(group.members))
     seed += group.config.first_seed
     chunks = []
-    for i, start in enumerate(range(0, total, size)):
-        chunk_place = place[start : start + size]
-        chunk_seed = seed[start : start + size]
-        chunks.append(Runs(f"{name}-{i:04d}", chunk_place, group.members[chunk_place], chunk_seed))
+    for chunk_number, first_run in enumerate(range(0, num_runs, chunk_size)):
+        chunk_members = member_index[first_run : first_run + chunk_size]
+        chunk_seed = seed[first_run : first_run + chunk_size]
+        chunks.append(
+            Runs(
+                f"{name}-{chunk_number:04d}",
+                chunk_members,
+                group.members[chunk_members],
+                chunk_seed,
+            )
+        )
     return chunks
 
 
-def _capacity(group: Group, ready: Ready) -> int:
+def _capacity(group: Group, ready_programs: Ready) -> int:
     """Returns how many runs of a group may be under way, as memory holds their states.
 
     Args:
       group: whose programs are traced for it, unless it is small.
-      ready: what they are made of.
+      ready_programs: what they are made of.
     """
-    if group.num_runs <= _FEW:
-        return _FEW
-    state_bytes = StateRows(ready.programs().like).size
-    return max(1, int(_MEMORY * host_memory() / (_COPIES * state_bytes)))
+    if group.num_runs <= _MIN_CHUNK_RUNS:
+        return _MIN_CHUNK_RUNS
+    state_bytes = StateRows(ready_programs.programs().like).size
+    return max(1, int(_MEMORY_SHARE * host_memory() / (_NUM_COPIES * state_bytes)))
 
 
 def describe(plan: Plan) -> str:
@@ -335,40 +355,41 @@ def describe(plan: Plan) -> str:
     group_plans = plan.group_plans
     # Of a sweep the first configuration is named; the others may differ in what is swept.
     config = group_plans[0].group.config
-    ready = group_plans[0].ready
-    subject = f"{counted(config.num_seeds, 'seed')} of {config.env}"
+    ready_programs = group_plans[0].ready
+    plan_subject = f"{counted(config.num_seeds, 'seed')} of {config.env}"
     programs = ""
     if plan.design.is_sweep:
-        sizes = [len(runs.seed) for group_plan in group_plans for runs in group_plan.chunks]
+        chunk_sizes = [len(runs.seed) for group_plan in group_plans for runs in group_plan.chunks]
         configurations = counted(plan.design.count(), "configuration")
-        subject = f"{configurations} of {subject}, {sum(sizes):,} runs,"
-        count = counted(len(group_plans), "compiled program")
-        programs = f"; {count}, {counted(len(sizes), 'chunk')} of up to {max(sizes):,} runs"
+        plan_subject = f"{configurations} of {plan_subject}, {sum(chunk_sizes):,} runs,"
+        program_count = counted(len(group_plans), "compiled program")
+        chunk_count = counted(len(chunk_sizes), "chunk")
+        programs = f"; {program_count}, {chunk_count} of up to {max(chunk_sizes):,} runs"
     devices = _describe_devices(plan.division)
     return (
-        f"Training {subject} by {config.algorithm}, {_budget(config)}, on {devices}, with the "
-        f"engine {ready.engine}: {ready.why}{programs}."
+        f"Training {plan_subject} by {config.algorithm}, {_budget(config)}, on {devices}, with the "
+        f"engine {ready_programs.engine}: {ready_programs.why}{programs}."
     )
 
 
 def _budget(config: Config) -> str:
     """Returns for how long each seed is trained."""
-    units = {"minutes": "min together", "max_updates": "updates each"}
+    budget_units = {"minutes": "min together", "max_updates": "updates each"}
     # ``minutes`` is in place of the env steps, whose default still stands in the settings.
     if config.minutes is None:
-        units["env_steps"] = "env steps each"
-    budgets = {unit: getattr(config, name) for name, unit in units.items()}
+        budget_units["env_steps"] = "env steps each"
+    budgets = {unit: getattr(config, name) for name, unit in budget_units.items()}
     return " or ".join(f"{x:,} {unit}" for unit, x in budgets.items() if x is not None)
 
 
 def _describe_devices(division: Division) -> str:
     """Returns which devices compute, of how many here."""
     num_devices = jax.local_device_count()
-    kind = jax.local_devices()[0].device_kind
+    device_kind = jax.local_devices()[0].device_kind
     if num_devices == 1:
-        return counted(num_cores(), "CPU core") if kind == "cpu" else f"one {kind}"
-    text = f"{division.count} of the {num_devices} devices here ({kind})"
+        return counted(num_cores(), "CPU core") if device_kind == "cpu" else f"one {device_kind}"
+    devices_text = f"{division.count} of the {num_devices} devices here ({device_kind})"
     if division.count > 1:
-        shared = "seeds" if division.seeds > 1 else "episodes of an update"
-        text += f", which share the {shared}"
-    return text
+        division_unit = "seeds" if division.seeds > 1 else "episodes of an update"
+        devices_text += f", which share the {division_unit}"
+    return devices_text

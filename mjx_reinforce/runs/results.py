@@ -27,14 +27,14 @@ from mjx_reinforce.training.driver import Evaluation, Observer, RunDriver
 class Callbacks(Observer[RunDriver]):
     """A user's own functions, called with each ``Evaluation``; one that returns true ends it."""
 
-    def __init__(self, functions: Sequence[Callable[[Evaluation], Any]]):
+    def __init__(self, callbacks: Sequence[Callable[[Evaluation], Any]]):
         """Takes the functions."""
-        self._functions = functions
+        self._functions = callbacks
 
     def evaluated(self, driver: RunDriver, evaluation: Evaluation, rows: Arrays) -> None:
         """Calls the functions."""
-        for function in self._functions:
-            if function(evaluation):
+        for callback in self._functions:
+            if callback(evaluation):
                 driver.ended = True
 
 
@@ -245,18 +245,18 @@ def sweep(
     base = _beginning("base", base, output)
     check_swept(over)
     # Both spellings are accepted, as --over does.
-    over = {name.replace("-", "_"): values for name, values in over.items()}
+    over = {name.replace("-", "_"): setting_values for name, setting_values in over.items()}
     directory = base.output
     with contextlib.ExitStack() as stack:
-        place = directory
+        folder = directory
         # The chunks of a sweep meet in its files alone, so one that leaves none has a folder, too.
-        if place is None:
-            place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sweep-")))
-        base = dataclasses.replace(base, output=place)
+        if folder is None:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sweep-")))
+        base = dataclasses.replace(base, output=folder)
         design = Design(base=base, over=over, exact=exact, chunk_runs=chunk_runs)
         outcome = perform(design, Interrupt(), quiet=quiet)
         report_on(outcome, report=report and directory is not None)
-        return read_results(place)._replace(directory=directory)
+        return read_results(folder)._replace(directory=directory)
 
 
 def _beginning(name: str, config: Config, output: Path | str | None) -> Config:
@@ -273,11 +273,11 @@ def _beginning(name: str, config: Config, output: Path | str | None) -> Config:
             f"this begins anew: python -m mjx_reinforce.train --resume {directory} goes on with "
             "what is there"
         )
-    place = config.output if output is None else output
+    output_directory = config.output if output is None else output
     # ``~`` is read as on the command line.
-    if place is not None:
-        place = Path(os.path.expanduser(place))
-    return dataclasses.replace(config, output=place)
+    if output_directory is not None:
+        output_directory = Path(os.path.expanduser(output_directory))
+    return dataclasses.replace(config, output=output_directory)
 
 
 def read_results(directory: Path) -> SweepResults:
@@ -290,7 +290,10 @@ def read_results(directory: Path) -> SweepResults:
         )
     with naming_damage(directory / "sweep.json"):
         # Each with its number, which here is its place in the list.
-        numbered = record["configurations"]
-        values = [{k: x for k, x in row.items() if k != "configuration"} for row in numbered]
+        records = record["configurations"]
+        configurations = [
+            {name: x for name, x in configuration.items() if name != "configuration"}
+            for configuration in records
+        ]
     arrays = read_arrays(directory / "curves.npz", SweepResults._fields[2:])
-    return SweepResults(directory, values, **arrays)
+    return SweepResults(directory, configurations, **arrays)

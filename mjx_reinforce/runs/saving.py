@@ -90,16 +90,16 @@ class Files(Observer[DriverT]):
         """Returns whether the runs of this name have ended."""
         return False
 
-    def updated(self, driver: DriverT, met: np.ndarray) -> None:
+    def updated(self, driver: DriverT, num_nonfinite: np.ndarray) -> None:
         """Saves if that is due; the last block is saved with its evaluation, by ``ended``."""
         self._check_place()
         self._saved = False
         num_updates = driver.config.checkpoint_every
         if num_updates is None:
-            due = time.perf_counter() - self._saved_at >= _CHECKPOINT_SECONDS
+            is_due = time.perf_counter() - self._saved_at >= _CHECKPOINT_SECONDS
         else:
-            due = driver.updates() - self._saved_updates >= num_updates
-        if due and not driver.record.finished():
+            is_due = driver.updates() - self._saved_updates >= num_updates
+        if is_due and not driver.record.finished():
             self._save(driver)
 
     def ended(self, driver: DriverT) -> None:
@@ -132,16 +132,16 @@ class Files(Observer[DriverT]):
         """Writes a checkpoint, or raises OSError."""
         raise NotImplementedError
 
-    def _attempt(self, name: str, write: Callable[[], None]) -> bool:
+    def _attempt(self, name: str, write_file: Callable[[], None]) -> bool:
         """Returns whether something could be written; the first failure in a row is shown.
 
         Args:
           name: of what is written, for the warning.
-          write: writes it, or raises OSError.
+          write_file: writes it, or raises OSError.
         """
         self._check_place()
         try:
-            write()
+            write_file()
         except OSError as error:
             # Where the directory is gone, that is the error, and it ends the run.
             self._check_place()
@@ -153,12 +153,12 @@ class Files(Observer[DriverT]):
         self._failing.discard(name)
         return True
 
-    def _folder(self, *names: str) -> Path:
+    def _folder(self, *folder_names: str) -> Path:
         """Returns a folder in the directory, which is made if it is not there."""
         folder = self._directory
         # One after the other, and not by ``parents=True``: that would make a directory anew that
         # was moved meanwhile.
-        for name in names:
+        for name in folder_names:
             folder /= name
             folder.mkdir(exist_ok=True)
         return folder
@@ -167,8 +167,8 @@ class Files(Observer[DriverT]):
         """Raises MovedError if the directory is not where it was."""
         check_place(self._directory, self._place)
 
-    def _write_json(self, name: str, content: dict[str, Any]) -> None:
-        write_json(self._directory / name, content)
+    def _write_json(self, name: str, json_content: dict[str, Any]) -> None:
+        write_json(self._directory / name, json_content)
 
 
 class RunFiles(Files[RunDriver]):
@@ -220,20 +220,20 @@ class RunFiles(Files[RunDriver]):
         A crash in between leaves a run that can be resumed: config.json is first, so that the
         budget in it chooses the same checkpoint.
         """
-        moment = {
+        run_progress = {
             "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "updates": driver.updates(),
             "env_steps": int(driver.record.env_steps.sum()),
         }
         budgets = {name: getattr(driver.config, name) for name in resume.BUDGETS}
-        resumed = [*self.contents.get("resumed", []), moment]
+        resumed = [*self.contents.get("resumed", []), run_progress]
         self._write_json("config.json", self.contents | budgets | {"resumed": resumed})
-        self._write_json("summary.json", {"status": "running", **moment})
+        self._write_json("summary.json", {"status": "running", **run_progress})
         if checkpoint is None:
-            resume.remove_checkpoints(self._checkpoints, after=0)
+            resume.remove_checkpoints(self._checkpoints, last_number=0)
             write_bytes(self._metrics, HEADER)
         else:
-            resume.remove_checkpoints(self._checkpoints, after=checkpoint.number)
+            resume.remove_checkpoints(self._checkpoints, last_number=checkpoint.number)
             files.cut(self._metrics, checkpoint.metrics_bytes)
 
     def evaluated(self, driver: RunDriver, evaluation: Evaluation, rows: Arrays) -> None:
@@ -261,20 +261,22 @@ class RunFiles(Files[RunDriver]):
         """Writes a checkpoint, the policies, and how far the run is, in case it is killed."""
         super()._save(driver)
         self._attempt("the policies", lambda: self._save_policies(driver))
-        reached = {
+        run_progress = {
             "status": "running",
             "env": driver.config.env,
             "num_seeds": driver.config.num_seeds,
             "updates": driver.updates(),
             "env_steps": int(driver.record.env_steps.sum()),
         }
-        self._attempt("summary.json", lambda: self._write_json("summary.json", reached))
+        self._attempt("summary.json", lambda: self._write_json("summary.json", run_progress))
 
     def _save_checkpoint(self, driver: RunDriver) -> None:
         """Writes a checkpoint, which says how long metrics.csv is with all rows in it."""
         self._write_rows()
-        content = driver.checkpoint()._replace(metrics_bytes=self._metrics.stat().st_size)
-        resume.save(self._checkpoints, content, even=content.is_even(driver.config.eval_every))
+        checkpoint = driver.checkpoint()._replace(metrics_bytes=self._metrics.stat().st_size)
+        resume.save(
+            self._checkpoints, checkpoint, is_even=checkpoint.is_even(driver.config.eval_every)
+        )
 
     def _save_policies(self, driver: RunDriver) -> None:
         """Writes the last and the best policies."""
@@ -289,7 +291,7 @@ class RunFiles(Files[RunDriver]):
 
 
 #: The arrays of curves.npz, and their types.
-_CURVES = {
+_CURVE_TYPES = {
     "configuration": np.int32,
     "seed": np.int32,
     "eval_return": np.float32,
@@ -322,8 +324,8 @@ class SweepFiles(Files[Driver]):
             **as_record(design),
             "num_seeds": design.base.num_seeds,
             "configurations": [
-                {"configuration": number, **values}
-                for number, values in enumerate(design.configurations)
+                {"configuration": configuration_number, **values}
+                for configuration_number, values in enumerate(design.configurations)
             ],
             "chunk_runs": [group_plan.limit for group_plan in group_plans],
             "local_devices": self._plan.division.count,
@@ -369,7 +371,9 @@ class SweepFiles(Files[Driver]):
         paths = sorted(self._parts.glob("*.npz"))
         parts = {path.stem: read_arrays(path, stored=True) for path in paths}
         if parts:
-            curves = join_parts([{name: part[name] for name in _CURVES} for part in parts.values()])
+            curves = join_parts(
+                [{name: part[name] for name in _CURVE_TYPES} for part in parts.values()]
+            )
             write_arrays(self._directory / "curves.npz", curves)
         if summary["status"] == "finished":
             # What a kill at this point left is written again, as a whole.
@@ -382,7 +386,7 @@ class SweepFiles(Files[Driver]):
             shutil.rmtree(self._parts)
 
     def _save_checkpoint(self, driver: Driver) -> None:
-        resume.save(self._checkpoints(driver), driver.checkpoint(), even=False)
+        resume.save(self._checkpoints(driver), driver.checkpoint(), is_even=False)
 
     def _checkpoints(self, driver: Driver) -> Path:
         """Returns the folder of a chunk's checkpoints."""
@@ -391,17 +395,17 @@ class SweepFiles(Files[Driver]):
     def _write_part(self, driver: Driver) -> None:
         """Writes what a chunk measured, and the last policies of each configuration's ends."""
         runs = driver.runs
-        arrays = since_their_end(driver.record.history()) | runs._asdict()
-        arrays["nonfinite"] = driver.record.nonfinite
-        curves = {name: arrays[name].astype(kind) for name, kind in _CURVES.items()}
-        last = {name: curves[name] for name in ("configuration", "seed")}
-        last["eval_return"] = curves["eval_return"][-1]
+        run_arrays = since_their_end(driver.record.history()) | runs._asdict()
+        run_arrays["nonfinite"] = driver.record.nonfinite
+        curves = {name: run_arrays[name].astype(dtype) for name, dtype in _CURVE_TYPES.items()}
+        finals = {name: curves[name] for name in ("configuration", "seed")}
+        finals["eval_return"] = curves["eval_return"][-1]
         # The worst and the best seed of a configuration in the whole sweep are its ends in their
         # chunks, too, so the policies of other seeds need not be stored.
-        rows = np.concatenate([_ends(last, n) for n in np.unique(runs.configuration)])
-        last |= arrays_of(driver.slots.states().train_states.actor)
-        ends = {f"ends/{name}": np.asarray(x)[rows] for name, x in last.items()}
-        write_arrays(self._parts / f"{runs.name}.npz", curves | ends)
+        rows = np.concatenate([_ends(finals, member) for member in np.unique(runs.configuration)])
+        finals |= arrays_of(driver.slots.states().train_states.actor)
+        end_arrays = {f"ends/{name}": np.asarray(x)[rows] for name, x in finals.items()}
+        write_arrays(self._parts / f"{runs.name}.npz", curves | end_arrays)
 
     def _write_policies(self, group_plan: GroupPlan, chunks: Sequence[Arrays]) -> None:
         """Writes the policies of the worst and the best seed of each configuration of a group.
@@ -412,46 +416,48 @@ class SweepFiles(Files[Driver]):
           group_plan: of the group.
           chunks: the arrays in the part of each of its chunks.
         """
-        last = {
+        last_arrays = {
             name.removeprefix("ends/"): np.concatenate([chunk[name] for chunk in chunks])
             for name in chunks[0]
-            if name not in _CURVES
+            if name not in _CURVE_TYPES
         }
         policy = group_plan.ready.policy
-        for number in group_plan.group.members.tolist():
-            rows = _ends(last, number)
-            ends = {name: values[rows] for name, values in last.items()}
-            seeds = ends.pop("seed")
-            returns = ends.pop("eval_return").astype(np.float64)
+        for configuration_number in group_plan.group.members.tolist():
+            rows = _ends(last_arrays, configuration_number)
+            end_arrays = {name: values[rows] for name, values in last_arrays.items()}
+            seeds = end_arrays.pop("seed")
+            returns = end_arrays.pop("eval_return").astype(np.float64)
             # What is left over after this are the arrays of the policies.
-            del ends["configuration"]
-            place = self._folder("policies", f"{number:03d}")
-            config = self._plan.design.configs[number]
+            del end_arrays["configuration"]
+            policy_folder = self._folder("policies", f"{configuration_number:03d}")
+            config = self._plan.design.configs[configuration_number]
             # ``policy`` is that of the group's first configuration, but for these numbers.
-            traced = {k: getattr(config, k) for k in group_plan.group.settings if k in policy}
-            folder = self._folder("policies", place.name, "policy")
-            save_policy(folder, actor_of(ends), policy | traced)
+            swept = {
+                key: getattr(config, key) for key in group_plan.group.settings if key in policy
+            }
+            folder = self._folder("policies", policy_folder.name, "policy")
+            save_policy(folder, actor_of(end_arrays), policy | swept)
             summary = {"status": "finished", "final_returns": returns.tolist()}
-            write_json(place / "summary.json", summary)
+            write_json(policy_folder / "summary.json", summary)
             settings = {"env": config.env, "horizon": group_plan.ready.horizon}
             if config.env_set:
                 settings["env_set"] = list(config.env_set)
             settings["seeds"] = seeds.tolist()
-            write_json(place / "config.json", settings)
+            write_json(policy_folder / "config.json", settings)
 
 
-def _ends(last: Arrays, number: int) -> np.ndarray:
+def _ends(last_arrays: Arrays, configuration_number: int) -> np.ndarray:
     """Returns which runs are the worst and the best seed of a configuration, or which is both.
 
     Args:
-      last: [R] each, ``configuration``, ``seed`` and the last ``eval_return``.
-      number: of the configuration.
+      last_arrays: [R] each, ``configuration``, ``seed`` and the last ``eval_return``.
+      configuration_number: of the configuration.
     """
-    runs = np.flatnonzero(last["configuration"] == number)
+    runs = np.flatnonzero(last_arrays["configuration"] == configuration_number)
     # By the seeds' numbers, so that equal returns choose the same seeds however chunks were cut.
-    runs = runs[np.argsort(last["seed"][runs])]
-    values = np.nan_to_num(last["eval_return"][runs], nan=-np.inf)
-    return runs[sorted({int(values.argmin()), int(values.argmax())})]
+    runs = runs[np.argsort(last_arrays["seed"][runs])]
+    finite_returns = np.nan_to_num(last_arrays["eval_return"][runs], nan=-np.inf)
+    return runs[sorted({int(finite_returns.argmin()), int(finite_returns.argmax())})]
 
 
 def since_their_end(history: Arrays) -> Arrays:
@@ -462,9 +468,11 @@ def since_their_end(history: Arrays) -> Arrays:
     """
     # A run that has not ended plays in every block, so env steps that stay the same say that it
     # has; from there on ``cumsum`` keeps the mark.
-    steps = history["env_steps"]
-    ended = np.cumsum(steps[1:] == steps[:-1], axis=0) > 0
-    return {n: np.concatenate([x[:1], np.where(ended, x[-1], x[1:])]) for n, x in history.items()}
+    env_steps = history["env_steps"]
+    ended = np.cumsum(env_steps[1:] == env_steps[:-1], axis=0) > 0
+    return {
+        name: np.concatenate([x[:1], np.where(ended, x[-1], x[1:])]) for name, x in history.items()
+    }
 
 
 def join_parts(parts: Sequence[Mapping[str, np.ndarray]]) -> Arrays:
@@ -472,14 +480,14 @@ def join_parts(parts: Sequence[Mapping[str, np.ndarray]]) -> Arrays:
 
     A run whose evaluations ended earlier repeats its last.
     """
-    length = max(len(part["eval_return"]) for part in parts)
+    num_evaluations = max(len(part["eval_return"]) for part in parts)
 
     def joined(name: str) -> np.ndarray:
         # Arrays [E, R] have a row an evaluation, arrays [R] have none.
-        arrays = [part[name] for part in parts]
-        arrays = [lengthened(x, length) if x.ndim > 1 else x for x in arrays]
-        return np.concatenate(arrays, axis=-1)
+        columns = [part[name] for part in parts]
+        columns = [lengthened(x, num_evaluations) if x.ndim > 1 else x for x in columns]
+        return np.concatenate(columns, axis=-1)
 
     # The last key counts first.
-    order = np.lexsort((joined("seed"), joined("configuration")))
-    return {name: joined(name)[..., order] for name in parts[0]}
+    run_order = np.lexsort((joined("seed"), joined("configuration")))
+    return {name: joined(name)[..., run_order] for name in parts[0]}

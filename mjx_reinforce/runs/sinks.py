@@ -26,7 +26,7 @@ from mjx_reinforce.statistics import iqm, iqm_interval
 #: Seeds that are shown one by one, the first ones: each is a curve for every column.
 MAX_SINGLE_SEEDS = 16
 #: Columns that say when an evaluation was; what is shown is their mean.
-_PROGRESS = ("env_steps", "episodes", "wall_seconds")
+_PROGRESS_COLUMNS = ("env_steps", "episodes", "wall_seconds")
 
 
 def chart_step(rows: Arrays) -> int:
@@ -36,8 +36,8 @@ def chart_step(rows: Arrays) -> int:
 
 def measured(rows: Arrays) -> Arrays:
     """Returns the columns [S] of one evaluation that say nothing of when it was."""
-    apart = ("seed", "update", *_PROGRESS)
-    return {name: values.astype(float) for name, values in rows.items() if name not in apart}
+    labels = ("seed", "update", *_PROGRESS_COLUMNS)
+    return {name: values.astype(float) for name, values in rows.items() if name not in labels}
 
 
 def scalars(rows: Arrays) -> dict[str, float]:
@@ -50,16 +50,16 @@ def scalars(rows: Arrays) -> dict[str, float]:
     Args:
       rows: of one evaluation.
     """
-    shown = {f"progress/{name}": float(rows[name].mean()) for name in _PROGRESS}
+    shown_scalars = {f"progress/{name}": float(rows[name].mean()) for name in _PROGRESS_COLUMNS}
     for name, values in measured(rows).items():
         # ``min`` is NaN if any seed's value is, and ``fmax`` passes over those.
         statistics = {"lowest": values.min(), "highest": np.fmax.reduce(values), "iqm": iqm(values)}
         # Of one column alone: an interval takes thousands of resamples.
         if name == "eval_return":
             statistics["iqm_low"], statistics["iqm_high"] = iqm_interval(values)
-        statistics |= {f"seed_{i}": x for i, x in enumerate(values[:MAX_SINGLE_SEEDS])}
-        shown |= {f"{name}/{key}": float(x) for key, x in statistics.items()}
-    return shown
+        statistics |= {f"seed_{seed}": x for seed, x in enumerate(values[:MAX_SINGLE_SEEDS])}
+        shown_scalars |= {f"{name}/{statistic}": float(x) for statistic, x in statistics.items()}
+    return shown_scalars
 
 
 EVENTS = "events.out.tfevents.*"
@@ -81,8 +81,8 @@ class TensorBoard:
         folder = directory / "tensorboard"
         folder.mkdir(exist_ok=True)
         # Readers sort the files by name.
-        place = f"{int(time.time()):010}.{socket.gethostname()}.{len([*folder.glob(EVENTS)]):04}"
-        self._path = folder / f"events.out.tfevents.{place}"
+        suffix = f"{int(time.time()):010}.{socket.gethostname()}.{len([*folder.glob(EVENTS)]):04}"
+        self._path = folder / f"events.out.tfevents.{suffix}"
         self._path.touch()
         self._add(file_version="brain.Event:2")
         # A START makes TensorBoard drop what it has from this step on.
@@ -92,8 +92,8 @@ class TensorBoard:
     def write(self, rows: Arrays) -> None:
         """Adds an event, or raises OSError and adds none."""
         # Not by ``summary.scalar``, which prints a line for every NaN.
-        shown = [{"tag": name, "simple_value": x} for name, x in scalars(rows).items()]
-        self._add(step=chart_step(rows), summary={"value": shown})
+        tagged_values = [{"tag": name, "simple_value": x} for name, x in scalars(rows).items()]
+        self._add(step=chart_step(rows), summary={"value": tagged_values})
 
     def close(self) -> None:
         """Does nothing: every event is written."""
@@ -104,11 +104,11 @@ class TensorBoard:
 
         proto: Any = importlib.import_module("tensorboardX.proto.event_pb2")
         event = proto.Event(wall_time=time.time(), **fields).SerializeToString()
-        length = struct.pack("<Q", len(event))
+        length_bytes = struct.pack("<Q", len(event))
         # In one write, which ``append`` takes back if the disk is full: behind half an event
         # nothing would be read.
-        checked = (x + struct.pack("<I", masked_crc32c(x)) for x in (length, event))
-        append(self._path, b"".join(checked))
+        checked_parts = (x + struct.pack("<I", masked_crc32c(x)) for x in (length_bytes, event))
+        append(self._path, b"".join(checked_parts))
 
 
 #: Has the id of the run.
@@ -128,18 +128,18 @@ class WeightsAndBiases:
         del updates  # W&B itself drops what it has
         import wandb
 
-        path = directory / WANDB_RUN
+        run_id_path = directory / WANDB_RUN
         mode = os.environ.get("WANDB_MODE", "offline")
         # Without this folder W&B writes elsewhere.
-        path.parent.mkdir(exist_ok=True)
+        run_id_path.parent.mkdir(exist_ok=True)
         # The id is drawn here, and not by W&B, so that a resumed run finds it in the file.
-        if not path.exists():
-            write_json(path, {"id": secrets.token_hex(4)})
+        if not run_id_path.exists():
+            write_json(run_id_path, {"id": secrets.token_hex(4)})
         with _errors_as_os_errors():
             self._run = wandb.init(
                 project=os.environ.get("WANDB_PROJECT", "mjx_reinforce"),
                 name=os.environ.get("WANDB_NAME", directory.resolve().name),
-                id=read_json(path)["id"],
+                id=read_json(run_id_path)["id"],
                 resume="allow",
                 config=read_json(directory / "config.json"),
                 dir=directory,

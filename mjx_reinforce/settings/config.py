@@ -107,21 +107,21 @@ class Config(
 
 def read_seeds(text: str) -> range:
     """Returns the numbers of seeds that --seeds names, or raises ValueError."""
-    first, _, end = text.partition(":")
+    first_seed, _, end_seed = text.partition(":")
     # ``int`` alone would take signs, spaces, underscores and the digits of other scripts.
-    is_number = all(word.isascii() and word.isdigit() for word in (first, end))
-    if not (is_number and int(first) < int(end) <= MAX_OF_UPDATE):
+    is_number = all(word.isascii() and word.isdigit() for word in (first_seed, end_seed))
+    if not (is_number and int(first_seed) < int(end_seed) <= MAX_OF_UPDATE):
         raise ValueError(
             f"--seeds must be FIRST:END, such as 64:128, got {text!r}; --num-seeds says how many"
         )
-    return range(int(first), int(end))
+    return range(int(first_seed), int(end_seed))
 
 
 @functools.cache
 def marked(mark: enum.Enum) -> tuple[str, ...]:
     """Returns the names of the settings that are declared with a mark."""
-    fields = dataclasses.fields(Config)
-    return tuple(field.name for field in fields if mark in field.metadata.get("marks", ()))
+    init_fields = dataclasses.fields(Config)
+    return tuple(field.name for field in init_fields if mark in field.metadata.get("marks", ()))
 
 
 def check(config: Config) -> None:
@@ -159,12 +159,12 @@ def check_each(config: Config) -> None:
 
 
 #: The package that each log needs.
-_NEEDED = {"tensorboard": "tensorboardX", "wandb": "wandb"}
+_LOG_PACKAGES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
 
 
 def _check_installed(log: str) -> None:
     """Raises ValueError if a log's package is missing; imports nothing."""
-    package = _NEEDED[log]
+    package = _LOG_PACKAGES[log]
     spec = importlib.util.find_spec(package)
     # A folder of that name, such as W&B leaves, is found too, but has no origin.
     if spec is None or spec.origin is None:
@@ -220,10 +220,10 @@ def check_read(config: Config, chosen_names: Collection[str]) -> None:
       chosen_names: of those that the user gave.
     """
     for reader in Reader:
-        idle = [name for name in marked(reader) if name in chosen_names]
-        if idle and not reader.holds(config):
-            flags = " ".join(as_flag(name, getattr(config, name)) for name in idle)
-            pronoun = "it" if len(idle) == 1 else "them"
+        idle_settings = [name for name in marked(reader) if name in chosen_names]
+        if idle_settings and not reader.holds(config):
+            flags = " ".join(as_flag(name, getattr(config, name)) for name in idle_settings)
+            pronoun = "it" if len(idle_settings) == 1 else "them"
             raise ValueError(
                 f"{flags} would do nothing: only {reader.words} reads that; leave {pronoun} out, "
                 f"or choose {reader.words}"
@@ -246,8 +246,8 @@ def check_read_by_policy(config: Config, default: Config, policy: str) -> None:
 
 def changed(config: Config, default: Config) -> tuple[str, ...]:
     """Returns the names of the settings in which two differ."""
-    names = (field.name for field in dataclasses.fields(Config))
-    return tuple(name for name in names if getattr(config, name) != getattr(default, name))
+    setting_names = (field.name for field in dataclasses.fields(Config))
+    return tuple(name for name in setting_names if getattr(config, name) != getattr(default, name))
 
 
 def as_flag(name: str, value: object) -> str:
@@ -257,8 +257,8 @@ def as_flag(name: str, value: object) -> str:
 
 def as_words(name: str, value: object) -> list[str]:
     """Returns the words of a setting on the command line; None, text, numbers or lists of them."""
-    values = value if isinstance(value, tuple | list) else (value,)
-    return [flag(name), *map(str, values)]
+    entries = value if isinstance(value, tuple | list) else (value,)
+    return [flag(name), *map(str, entries)]
 
 
 #: Settings that may name code of the user's own, which runs only where the command line names it:

@@ -30,10 +30,10 @@ def read_tables(name: str) -> dict[str, dict[str, Any]]:
     for title, table in tomllib.loads(text).items():
         parents = [tables[parent] for parent in table.pop("like", ())]
         # TOML has neither tuples nor None.
-        values = {name: tuple(x) if isinstance(x, list) else x for name, x in table.items()}
-        values = {name: None if x == "None" else x for name, x in values.items()}
+        settings = {name: tuple(x) if isinstance(x, list) else x for name, x in table.items()}
+        settings = {name: None if x == "None" else x for name, x in settings.items()}
         # Of two the later one counts, and the table's own values count most.
-        tables[title] = functools.reduce(operator.or_, [*parents, values])
+        tables[title] = functools.reduce(operator.or_, [*parents, settings])
     return tables
 
 
@@ -74,7 +74,7 @@ _EVALUATIONS = 50
 #: More env steps of a seed than a minute gives the small tasks, whose default run is shorter.
 _PLENTY = 60_000_000
 #: In a long run it has so many a minute, of as many seeds as a default run has.
-_A_MINUTE = 3
+_PER_MINUTE = 3
 
 
 def of_task(
@@ -102,30 +102,30 @@ def of_task(
       >>> dataclasses.replace(config, num_seeds=8).num_seeds, config.env_steps
       (8, 20000)
     """
-    smallest = dataclasses.replace(Config(env=env, num_seeds=num_seeds), **OF_TASKS.get(env, {}))
-    config = smallest
-    measured = MINUTES.get(env)
-    if env_steps is None and minutes is None and not measured:
-        return smallest
+    base = dataclasses.replace(Config(env=env, num_seeds=num_seeds), **OF_TASKS.get(env, {}))
+    config = base
+    speeds = MINUTES.get(env)
+    if env_steps is None and minutes is None and not speeds:
+        return base
     # Env steps of a seed in a minute. Of small tasks none are measured, for their default run is
     # shorter; of a task of the user's own nobody knows, and the default budget stands for them.
-    if measured:
-        on_cpu, on_gpu = measured
+    if speeds:
+        cpu_speed, gpu_speed = speeds
         # Two cores share their time among the seeds, so fewer seeds get more of it each, up to the
         # greater of both numbers: more is of no use to the task.
-        shared = on_cpu * Config.num_seeds // min(max(num_seeds, 1), Config.num_seeds)
-        minute = on_gpu if has_gpu() else min(shared, max(measured))
+        shared = cpu_speed * Config.num_seeds // min(max(num_seeds, 1), Config.num_seeds)
+        minute_steps = gpu_speed if has_gpu() else min(shared, max(speeds))
     elif env in HORIZONS:
-        minute = _PLENTY
+        minute_steps = _PLENTY
     else:
-        minute = smallest.env_steps or 0
+        minute_steps = base.env_steps or 0
     budget = env_steps
     if budget is None:
-        budget = max(1, round(minute * (1 if minutes is None else minutes)))
-    for least, settings in OF_BUDGETS.get(env, ()):
+        budget = max(1, round(minute_steps * (1 if minutes is None else minutes)))
+    for min_steps, settings in OF_BUDGETS.get(env, ()):
         # On a GPU few episodes take as long as many.
-        if budget >= least or (env_steps is None and has_gpu()):
-            config = dataclasses.replace(smallest, **settings)
+        if budget >= min_steps or (env_steps is None and has_gpu()):
+            config = dataclasses.replace(base, **settings)
     config = dataclasses.replace(config, env_steps=budget)
     # After its decay a run would go on at the final learning rate, which is the lowest.
     if isinstance(config.decay_steps, int) and config.decay_steps < budget:
@@ -134,9 +134,9 @@ def of_task(
         return config
     # In a run so long that an interrupt, which waits for the updates between two evaluations, would
     # wait long, there are a few a minute.
-    every = min(budget // _EVALUATIONS, minute // _A_MINUTE)
-    every //= config.episodes_per_update * config.training_horizon(HORIZONS[env])
-    return dataclasses.replace(config, eval_every=max(config.eval_every, every))
+    period = min(budget // _EVALUATIONS, minute_steps // _PER_MINUTE)
+    period //= config.episodes_per_update * config.training_horizon(HORIZONS[env])
+    return dataclasses.replace(config, eval_every=max(config.eval_every, period))
 
 
 def num_cores() -> int:
@@ -166,15 +166,15 @@ def named_code(arguments: Sequence[str]) -> dict[str, str | None]:
 def flag_value(arguments: Sequence[str], flag: str) -> str | None:
     """Returns what a command line gives a flag, the last time that it does; None if nothing."""
     flag_text = None
-    for word, following in itertools.zip_longest(arguments, arguments[1:]):
+    for word, next_word in itertools.zip_longest(arguments, arguments[1:]):
         name, equals, text = word.partition("=")
         # Both spellings are accepted, --env-steps and --env_steps.
         if spoken(name) != flag:
             continue
         if equals:
             flag_text = text
-        elif following:
-            flag_text = following
+        elif next_word:
+            flag_text = next_word
     return flag_text
 
 

@@ -28,7 +28,7 @@ Form = TypeVar("Form")
 #: How values are read, in every command: as ``--over`` reads them.
 _READERS = ConstructorRegistry()
 #: What is read otherwise than tyro does -> its name in --help, and how.
-_READ: dict[Any, tuple[str, Callable[[str], Any]]] = {
+_CONVERTERS: dict[Any, tuple[str, Callable[[str], Any]]] = {
     int: ("INT", whole_number),
     type(None): ("{None}", functools.partial(read_as, type(None))),
     Path: ("PATH", lambda word: Path(os.path.expanduser(word))),
@@ -42,9 +42,9 @@ _OTHER_NAMES = {"--distribution": "--policy"}
 @_READERS.primitive_rule
 def _reader(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     """Returns how a value is read, such as the number 1e6, None in any case, or a path with ~."""
-    if kind.type not in _READ:
+    if kind.type not in _CONVERTERS:
         return None
-    metavar, read = _READ[kind.type]
+    metavar, read = _CONVERTERS[kind.type]
     return PrimitiveConstructorSpec(
         nargs=1,
         metavar=metavar,
@@ -119,8 +119,8 @@ def about_word(word: str) -> str:
     """Returns the message about a word that is neither a flag nor its value, with the remedy."""
     if word in envs.names() or is_own(word):
         return f"{word!r} is a task: write {command('train')} --env {word}"
-    near = nearest(word, [*envs.names(), *PRESETS, *COMMANDS])
-    hint = f" Did you mean {near!r}?" if near else ""
+    nearest_name = nearest(word, [*envs.names(), *PRESETS, *COMMANDS])
+    hint = f" Did you mean {nearest_name!r}?" if nearest_name else ""
     return f"no flag or command takes {word!r}.{hint} (See --help.)"
 
 

@@ -65,7 +65,7 @@ def build(
     normalize_steps = config.normalize_steps
     if normalize_steps is None:  # without end
         normalize_steps = math.inf
-    shared = {  # of all algorithms, the user's too
+    common = {  # of all algorithms, the user's too
         "policy": policy,
         "horizon": training_horizon,
         "normalize_steps": normalize_steps,
@@ -73,15 +73,15 @@ def build(
         "engine": config.engine,
     }
     if is_own(config.algorithm):
-        learner = _call_choice("algorithm", config.algorithm, ALGORITHMS, env, config, **shared)
+        learner = _call_choice("algorithm", config.algorithm, ALGORITHMS, env, config, **common)
         # What the user's code returns fails here in one line, not inside of a program.
         wrappers.check_learner(config.algorithm, learner)
         return learner, horizon
     algorithm = find_algorithm(config.algorithm)
-    learner = load_definition(algorithm.make)(env, config, **shared)
+    learner = load_definition(algorithm.make)(env, config, **common)
     # A search plays no ``Trajectory`` of one policy, which the wrappers take.
     if not algorithm.search_episodes:
-        learner = _for_many_seeds(learner, config, shared["horizon"], devices)
+        learner = _for_many_seeds(learner, config, common["horizon"], devices)
     return learner, horizon
 
 
@@ -144,9 +144,9 @@ def _call_choice(
     kind: str, name: str, choices: Mapping[str, Any], *arguments: object, **options: object
 ) -> Any:
     """Returns what the user's own function returns, or raises ValueError with what it raised."""
-    make = load_choice(kind, name, choices)
+    build_choice = load_choice(kind, name, choices)
     try:
-        return make(*arguments, **options)
+        return build_choice(*arguments, **options)
     except (Exception, SystemExit) as error:  # the user's code may raise anything
         raise ValueError(f"cannot build the {kind} {name!r}: {explain(error)}") from error
 
@@ -192,18 +192,18 @@ def _build_optimizer(config: Config, space: Box | Discrete) -> optax.GradientTra
         optimizer = optax.chain(optax.sgd(rate), optax.scale(1 / config.learning_rate))
     if config.decay_steps is None:
         return optimizer
-    length = config.decay_steps
-    if length == "budget":  # as long as that, of env steps or updates
-        length = None
+    steps = config.decay_steps
+    if steps == "budget":  # as long as that, of env steps or updates
+        steps = None
     # Behind the optimizer: Adam would divide a factor on its gradients out again.
-    optimizer = optax.chain(optimizer, schedules.decay_rate(final_rate / rate, length))
+    optimizer = optax.chain(optimizer, schedules.decay_rate(final_rate / rate, steps))
     if config.final_std is None:
         return optimizer
     initial_std = config.initial_std
     if initial_std is None:  # a trained deviation has bounds of actions, or none
         initial_std = default_std(cast(Box, space))
     ratio = config.final_std / initial_std
-    return optax.chain(optimizer, schedules.shrink_std(ratio, length))
+    return optax.chain(optimizer, schedules.shrink_std(ratio, steps))
 
 
 def _build_update(config: Config, policy: Policy) -> Update:

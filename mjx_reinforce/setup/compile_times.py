@@ -12,7 +12,7 @@ from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import num_cores
 
 #: What decides how long they take, of the settings.
-_DECISIVE = ("env", "env_set", "algorithm", "engine", "hidden_sizes", "estimator", "update")
+_SETTINGS = ("env", "env_set", "algorithm", "engine", "hidden_sizes", "estimator", "update")
 #: Of most of the package's tasks, on two CPU cores and on a GPU, roughly.
 _TYPICAL_TIME = "usually 5 to 40 s on a quiet machine"
 
@@ -43,5 +43,5 @@ def keep_seconds(config: Config, swept: Iterable[str], seconds: float) -> None:
 def _key(config: Config, swept: Iterable[str]) -> str:
     """Returns the name under which the time is kept, on this machine."""
     machine = [jax.local_devices()[0].device_kind, num_cores()]
-    description = repr([machine, *(getattr(config, name) for name in _DECISIVE), sorted(swept)])
+    description = repr([machine, *(getattr(config, name) for name in _SETTINGS), sorted(swept)])
     return f"{hashlib.sha256(description.encode()).hexdigest()}-seconds"

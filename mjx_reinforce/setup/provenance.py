@@ -8,7 +8,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-_RECORDED = ("mjx-reinforce", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "optax", "flax")
+_PACKAGES = ("mjx-reinforce", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "optax", "flax")
 
 
 def provenance() -> dict[str, Any]:
@@ -20,7 +20,7 @@ def provenance() -> dict[str, Any]:
 
     return {
         "python": platform.python_version(),
-        "packages": {name: version(name) for name in _RECORDED},
+        "packages": {name: version(name) for name in _PACKAGES},
         "git_commit": _git_commit(),
         "device": str(jax.local_devices()[0].device_kind),
         **available.known_by(),

@@ -168,7 +168,7 @@ def build_ready(
     )
 
 
-_PROGRAMS = ("begin", "advance", "evaluate")
+_PROGRAM_NAMES = ("begin", "advance", "evaluate")
 
 
 def key_of(config: Config) -> str | None:
@@ -185,15 +185,15 @@ def key_of(config: Config) -> str | None:
         return None
     if "xml_file" in split_words(config.env_set):  # the file may change
         return None
-    origin = provenance()
-    del origin["git_commit"]  # the sources say it better
+    program_provenance = provenance()
+    del program_provenance["git_commit"]  # the sources say it better
     # Of the budgets, ``block_length`` says what changes a program.
     inputs = marked(Mark.NOT_COMPILED)
     settings = {k: v for k, v in recordable(config).items() if k not in inputs}
     dependencies = {
         "settings": settings | {"block": config.block_length},
         "engine": cache.made_by("mjx_reinforce"),
-        "made_by": origin,
+        "made_by": program_provenance,
         "numpy": version("numpy"),
     }
     return hashlib.sha256(json.dumps(dependencies, sort_keys=True).encode()).hexdigest()
@@ -209,37 +209,37 @@ def save_ready(key: str, ready: Ready) -> Ready:
       ready: what is saved; all of it but the programs is in JSON's types.
     """
     programs = ready.programs()
-    like = programs.like
-    facts = ready._asdict()
-    del facts["programs"]
+    state_shapes = programs.like
+    json_facts = ready._asdict()
+    del json_facts["programs"]
     cache = Cache.find()
     assert cache is not None  # there is a key
     # A state of the user's own classes is no error; it is not saved.
     try:
-        content = {
-            "facts": facts,
-            "like": describe_tree(like),
+        json_content = {
+            "facts": json_facts,
+            "like": describe_tree(state_shapes),
             "advance_evaluates": programs.advance_evaluates,
         }
     except TypeError:
         return ready
-    cache.write(f"{key}-facts", json.dumps(content).encode())
+    cache.write(f"{key}-facts", json.dumps(json_content).encode())
     # Shapes of the arguments, in the order in which ``Programs`` describes them.
-    width = len(like.eval_keys)
+    slot_width = len(state_shapes.eval_keys)
     seed = jax.ShapeDtypeStruct((), np.uint32)
-    numbers = jax.ShapeDtypeStruct((width,), np.uint32)
-    rows = jax.ShapeDtypeStruct((width, StateRows(like).size), np.uint8)
+    seed_numbers = jax.ShapeDtypeStruct((slot_width,), np.uint32)
+    rows = jax.ShapeDtypeStruct((slot_width, StateRows(state_shapes).size), np.uint8)
     budget = (jax.ShapeDtypeStruct((2,), np.uint32),) * len(Budget._fields)
-    occupied = jax.ShapeDtypeStruct((width,), bool)
+    occupied = jax.ShapeDtypeStruct((slot_width,), bool)
     evaluation_due = jax.ShapeDtypeStruct((), bool)
     arguments = {
-        "begin": (seed, numbers, {}),  # a run has no settings that are traced
+        "begin": (seed, seed_numbers, {}),  # a run has no settings that are traced
         "advance": (rows, budget, occupied, evaluation_due),
         "evaluate": (rows, occupied),
     }
     exported = {
         name: cache.keep(f"{key}-{name}", getattr(programs, name), arguments[name])
-        for name in _PROGRAMS
+        for name in _PROGRAM_NAMES
     }
     programs = programs._replace(**exported)
     return ready._replace(programs=lambda: programs)
@@ -250,22 +250,22 @@ def load_ready(key: str, division: Division = ALONE) -> Ready | None:
     cache = Cache.find()
     if cache is None:
         return None
-    text = cache.read(f"{key}-facts")
-    if text is None:
+    json_text = cache.read(f"{key}-facts")
+    if json_text is None:
         return None
     # A crash may have left some of them, and one that JAX could not export is never there.
-    loaded_programs: list[Any] = [cache.load(f"{key}-{name}") for name in _PROGRAMS]
+    loaded_programs: list[Any] = [cache.load(f"{key}-{name}") for name in _PROGRAM_NAMES]
     if any(program is None for program in loaded_programs):
         return None
-    content = json.loads(text)
-    like = rebuild(content["like"])
+    json_content = json.loads(json_text)
+    state_shapes = rebuild(json_content["like"])
     programs = Programs(
         *loaded_programs,
-        advance_evaluates=content["advance_evaluates"],
-        like=like,
+        advance_evaluates=json_content["advance_evaluates"],
+        like=state_shapes,
         division=division,
     )
-    return Ready(**content["facts"], programs=lambda: programs)
+    return Ready(**json_content["facts"], programs=lambda: programs)
 
 
 #: The packages whose classes a description may name.
@@ -285,20 +285,20 @@ def describe_tree(tree: PyTree) -> Any:
         return None
     if isinstance(tree, dict):
         return {"dict": {name: describe_tree(x) for name, x in tree.items()}}
-    kind = type(tree)
-    fields = _fields(tree)
+    owner = type(tree)
+    field_names = _fields(tree)
     # Classes are named, and loaded by that name; a name in a file must not load any code there is.
-    if fields is not None:
-        if kind.__module__.partition(".")[0] not in _PACKAGES:
-            raise TypeError(f"{kind} is of another package than {', '.join(_PACKAGES)}")
-        if "." in kind.__qualname__:
-            raise TypeError(f"{kind} is not at the top of its module")
-        values = {name: describe_tree(getattr(tree, name)) for name in fields}
-        return {"class": f"{kind.__module__}:{kind.__qualname__}", "fields": values}
+    if field_names is not None:
+        if owner.__module__.partition(".")[0] not in _PACKAGES:
+            raise TypeError(f"{owner} is of another package than {', '.join(_PACKAGES)}")
+        if "." in owner.__qualname__:
+            raise TypeError(f"{owner} is not at the top of its module")
+        members = {name: describe_tree(getattr(tree, name)) for name in field_names}
+        return {"class": f"{owner.__module__}:{owner.__qualname__}", "fields": members}
     if isinstance(tree, tuple | list):
-        return {kind.__name__: [describe_tree(x) for x in tree]}
+        return {owner.__name__: [describe_tree(x) for x in tree]}
     if not hasattr(tree, "shape"):
-        raise TypeError(f"a leaf of {kind}")
+        raise TypeError(f"a leaf of {owner}")
     return {"leaf": "key" if is_key(tree) else np.dtype(tree.dtype).name, "shape": list(tree.shape)}
 
 
@@ -318,8 +318,8 @@ def rebuild(description: Any) -> Any:
         module, _, name = description["class"].partition(":")
         if module.partition(".")[0] not in _PACKAGES:
             raise ValueError(f"{module} is of another package than {', '.join(_PACKAGES)}")
-        values = {name: rebuild(x) for name, x in description["fields"].items()}
-        return getattr(importlib.import_module(module), name)(**values)
+        field_trees = {name: rebuild(x) for name, x in description["fields"].items()}
+        return getattr(importlib.import_module(module), name)(**field_trees)
     if "dict" in description:
         return {name: rebuild(x) for name, x in description["dict"].items()}
     ((kind, children),) = description.items()

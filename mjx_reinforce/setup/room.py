@@ -17,16 +17,16 @@ from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.declare import MAX_OF_UPDATE
 from mjx_reinforce.settings.groups import Reader
 
-_FLOAT = 4
+_FLOAT_SIZE = 4
 #: Copies of the states of training while an update is made: those before it and after it on the
 #: device; on the host its own, those before the last block, and the policies alone the best.
 _DEVICE_STATES = 2
 _HOST_STATES = 2
 #: What an optimizer keeps of each parameter, with the parameter itself.
-_ADAM = 3
-_SGD = 1
+_ADAM_SIZE = 3
+_SGD_SIZE = 1
 #: Vectors of the conjugate gradients: the solution, the residual, the direction, its product.
-_SOLVER = 4
+_SOLVER_VECTORS = 4
 
 
 def check_networks(
@@ -41,11 +41,11 @@ def check_networks(
       horizon: T, the time limit of a training episode in steps.
       num_seeds: how many a device trains at once.
     """
-    steps = config.episodes_per_update * horizon
-    if steps > MAX_OF_UPDATE:
+    num_steps = config.episodes_per_update * horizon
+    if num_steps > MAX_OF_UPDATE:
         raise ValueError(
-            f"an update may have {steps:,} env steps ({config.episodes_per_update:,} episodes of "
-            f"{horizon:,}), and fewer than 2^31 are counted; lower --num-episodes or --horizon"
+            f"an update may have {num_steps:,} env steps ({config.episodes_per_update:,} episodes "
+            f"of {horizon:,}), and fewer than 2^31 are counted; lower --num-episodes or --horizon"
         )
     check_room(num_seeds * float(_of_seed(config, policy, observation_size(env), horizon)))
 
@@ -56,30 +56,34 @@ def _of_seed(config: Config, policy: Policy, entries: int, horizon: int) -> int:
     Of other algorithms than ``reinforce`` it counts what any keeps, the parameters.
     """
     leaves = jax.tree.leaves(jax.eval_shape(policy.init, jax.random.key(0)))
-    weights = _FLOAT * sum(math.prod(x.shape) for x in leaves)
-    states = weights
-    temporary = 0
+    param_bytes = _FLOAT_SIZE * sum(math.prod(x.shape) for x in leaves)
+    state_bytes = param_bytes
+    scratch = 0
     if config.algorithm == "reinforce":
-        value = _value_bytes(config, entries)
-        natural = config.update == "natural-gradient"
+        value_bytes = _value_bytes(config, entries)
+        is_natural = config.update == "natural-gradient"
         # Natural gradients take their steps by SGD, whatever the optimizer of the settings is.
-        adam = config.optimizer == "adam" and not natural
-        states = (_ADAM if adam else _SGD) * weights + _ADAM * value
+        is_adam = config.optimizer == "adam" and not is_natural
+        state_bytes = (
+            _ADAM_SIZE if is_adam else _SGD_SIZE
+        ) * param_bytes + _ADAM_SIZE * value_bytes
         # Vectors as long as the parameters: the gradient, those of groups of episodes that tell
         # its noise, and the solver's. Then what the hidden layers put out for a chunk of steps.
-        vectors = 1 + num_noise_episodes(config.num_episodes) + _SOLVER * natural
+        vectors = 1 + num_noise_episodes(config.num_episodes) + _SOLVER_VECTORS * is_natural
         samples = config.num_episodes * chunk_length(horizon, config.num_episodes)
-        temporary = vectors * weights + value + _FLOAT * samples * sum(config.hidden_sizes)
+        scratch = (
+            vectors * param_bytes + value_bytes + _FLOAT_SIZE * samples * sum(config.hidden_sizes)
+        )
     # On a CPU the host's memory is the device's too.
-    host = 0
+    host_bytes = 0
     if jax.default_backend() == "cpu":
-        host = _HOST_STATES * states + weights
-    return _DEVICE_STATES * states + temporary + host
+        host_bytes = _HOST_STATES * state_bytes + param_bytes
+    return _DEVICE_STATES * state_bytes + scratch + host_bytes
 
 
 def _value_bytes(config: Config, entries: int) -> int:
     """Returns the bytes of a value network, 0 without one; it sees the time too."""
     if not Reader.VALUE_BASELINE.holds(config):
         return 0
-    sizes = entries + 1, *config.value_hidden_sizes, 1
-    return _FLOAT * sum((x + 1) * y for x, y in itertools.pairwise(sizes))
+    layer_sizes = entries + 1, *config.value_hidden_sizes, 1
+    return _FLOAT_SIZE * sum((x + 1) * y for x, y in itertools.pairwise(layer_sizes))

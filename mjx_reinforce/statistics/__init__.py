@@ -42,10 +42,10 @@ def alike(values: np.ndarray, size: Any = 0.0) -> np.ndarray:
     """
     low = np.min(values, axis=-1)
     high = np.max(values, axis=-1)
-    largest = np.maximum(np.maximum(np.abs(low), np.abs(high)), size)
+    magnitude = np.maximum(np.maximum(np.abs(low), np.abs(high)), size)
     # Where a value is -inf, the difference is inf or NaN, and never within the tolerance.
     with np.errstate(invalid="ignore"):  # where all failed
-        return high - low <= np.finfo(np.float32).eps * np.where(largest < np.inf, largest, 0.0)
+        return high - low <= np.finfo(np.float32).eps * np.where(magnitude < np.inf, magnitude, 0.0)
 
 
 def worst_if_not_finite(values: ArrayLike) -> np.ndarray:
@@ -69,11 +69,11 @@ def iqm(values: np.ndarray, axis: int = -1) -> np.ndarray:
       >>> mr.iqm([0.0, 1.0, 2.0, 100.0]).item()  # the middle half
       1.5
     """
-    failures_lowest = np.where(np.isfinite(values), values, -np.inf)
-    ranked = np.sort(np.moveaxis(failures_lowest, axis, -1), axis=-1)
+    lowered_values = np.where(np.isfinite(values), values, -np.inf)
+    ranked_values = np.sort(np.moveaxis(lowered_values, axis, -1), axis=-1)
     # Whole seeds, rounded down; failures are cut first, up to a quarter of all seeds.
-    cut = int(_QUARTER * ranked.shape[-1])
-    return finite_or_nan(ranked[..., cut : ranked.shape[-1] - cut].mean(axis=-1))
+    cut = int(_QUARTER * ranked_values.shape[-1])
+    return finite_or_nan(ranked_values[..., cut : ranked_values.shape[-1] - cut].mean(axis=-1))
 
 
 def iqm_interval(
@@ -189,10 +189,10 @@ def cvar(values: ArrayLike, fraction: float = 0.1) -> np.ndarray:
     ``fraction * S`` is not whole, the last seed of the tail counts in part; fewer than
     ``1 / fraction`` seeds give their minimum. NaN where a seed failed.
     """
-    ordered = np.sort(worst_if_not_finite(values), axis=-1)
-    size = fraction * ordered.shape[-1]
+    sorted_values = np.sort(worst_if_not_finite(values), axis=-1)
+    size = fraction * sorted_values.shape[-1]
     weights = np.clip(size - np.arange(math.ceil(size)), 0, 1) / size
-    tail = ordered[..., : len(weights)]
+    tail = sorted_values[..., : len(weights)]
     # Differences from the last value have no rounding where all values are alike.
     with np.errstate(invalid="ignore"):  # of failed seeds
         return finite_or_nan(tail[..., -1] + (tail - tail[..., -1:]) @ weights)

@@ -23,31 +23,31 @@ def draws(num_seeds: int) -> np.ndarray:
 
     The draws are those of ``scipy.stats.bootstrap(..., rng=np.random.default_rng(0))``.
     """
-    counts = np.empty((num_seeds, RESAMPLES), np.uint8)
+    draw_counts = np.empty((num_seeds, RESAMPLES), np.uint8)
     random = np.random.default_rng(0)
     block_size = max(1, _DRAWS // num_seeds)
     # Blocks draw what one call would: the generator fills its arrays in the order of their rows.
     for start in range(0, RESAMPLES, block_size):
-        drawn = random.integers(0, num_seeds, (min(block_size, RESAMPLES - start), num_seeds))
+        seeds = random.integers(0, num_seeds, (min(block_size, RESAMPLES - start), num_seeds))
         # Each resample counts in numbers of its own, so that one call counts all of the block.
-        drawn += num_seeds * np.arange(len(drawn))[:, None]
-        seed_counts = np.bincount(drawn.ravel(), minlength=drawn.size).reshape(drawn.shape)
-        counts[:, start : start + len(drawn)] = seed_counts.T
+        seeds += num_seeds * np.arange(len(seeds))[:, None]
+        seed_counts = np.bincount(seeds.ravel(), minlength=seeds.size).reshape(seeds.shape)
+        draw_counts[:, start : start + len(seeds)] = seed_counts.T
     # The cache hands the same array to everyone.
-    counts.flags.writeable = False
-    return counts
+    draw_counts.flags.writeable = False
+    return draw_counts
 
 
 @functools.lru_cache(maxsize=2)
 def _draws_between(num_seeds: int, low: int, high: int) -> np.ndarray:
     """Returns how many draws of each rank are from the ``low``-th to before the ``high``-th."""
-    counts = np.empty((num_seeds, RESAMPLES), np.uint8)
+    draw_counts = np.empty((num_seeds, RESAMPLES), np.uint8)
     for block in _blocks():
         # How many draws of a resample are of this seed or of lower ones, cut to the range.
-        until = np.cumsum(draws(num_seeds)[:, block], axis=0, dtype=np.int32)
-        counts[:, block] = np.diff(np.clip(until, low, high), axis=0, prepend=low)
-    counts.flags.writeable = False
-    return counts
+        cumulated_draws = np.cumsum(draws(num_seeds)[:, block], axis=0, dtype=np.int32)
+        draw_counts[:, block] = np.diff(np.clip(cumulated_draws, low, high), axis=0, prepend=low)
+    draw_counts.flags.writeable = False
+    return draw_counts
 
 
 def _blocks() -> list[slice]:
@@ -66,23 +66,23 @@ def resampled_trim_means(values: np.ndarray, cut: float = 0.0) -> np.ndarray:
     """
     num_seeds = values.shape[1]
     num_trimmed = int(cut * num_seeds)
-    counts = _draws_between(num_seeds, num_trimmed, num_seeds - num_trimmed)
+    draw_counts = _draws_between(num_seeds, num_trimmed, num_seeds - num_trimmed)
     # The lowest and highest seeds may lie in no resample's range: the product leaves them out.
-    ranks = counts.any(axis=1)
-    ordered = np.sort(values, axis=1)
+    ranks = draw_counts.any(axis=1)
+    sorted_values = np.sort(values, axis=1)
     # Sums of how far values are above the middle one have no rounding where all equal it.
-    middle = ordered[:, [num_seeds // 2]]
-    middle = np.where(np.isneginf(middle), 0.0, middle)
-    above = np.where(np.isneginf(ordered), 0.0, ordered - middle)[:, ranks]
+    medians = sorted_values[:, [num_seeds // 2]]
+    medians = np.where(np.isneginf(medians), 0.0, medians)
+    deviations = np.where(np.isneginf(sorted_values), 0.0, sorted_values - medians)[:, ranks]
     means = np.empty((len(values), RESAMPLES))
     for block in _blocks():
-        means[:, block] = above @ counts[ranks, block].astype(float)
+        means[:, block] = deviations @ draw_counts[ranks, block].astype(float)
     means /= num_seeds - 2 * num_trimmed
-    means += middle
+    means += medians
     # The product has 0 in place of -inf, which times 0 would be NaN. A mean is -inf if its lowest
     # rank is.
-    lowest = np.argmax(counts > 0, axis=0)
-    means[lowest < np.sum(np.isneginf(ordered), axis=1, keepdims=True)] = -np.inf
+    lowest_rank = np.argmax(draw_counts > 0, axis=0)
+    means[lowest_rank < np.sum(np.isneginf(sorted_values), axis=1, keepdims=True)] = -np.inf
     return means
 
 
@@ -104,7 +104,7 @@ def expanded_tail(confidence: float, freedom: int, shrinkage: float = 1.0) -> fl
     return float(special.ndtr(quantile))
 
 
-def percentiles(resampled: np.ndarray, tail: float) -> np.ndarray:
+def percentiles(resampled_means: np.ndarray, tail: float) -> np.ndarray:
     """Returns the ends [2, P] that cut off the tail of resampled statistics [P, B] on each side."""
     with np.errstate(invalid="ignore"):  # between two resamples that have none
-        return np.quantile(resampled, [tail, 1 - tail], axis=-1)
+        return np.quantile(resampled_means, [tail, 1 - tail], axis=-1)

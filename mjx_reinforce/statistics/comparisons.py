@@ -78,21 +78,21 @@ def probability_of_improvement(
     """
     x = worst_if_not_finite(x)
     y = worst_if_not_finite(y)
-    of_x, of_y = _placements(x, y)
-    rate = of_x.mean(axis=-1)
+    placements_x, placements_y = _placements(x, y)
+    rate = placements_x.mean(axis=-1)
     if not paired:
-        variance = _variance_of_mean(of_x) + _variance_of_mean(of_y)
+        variance = _variance_of_mean(placements_x) + _variance_of_mean(placements_y)
     elif x.shape == y.shape:
         # Of the sums, seed by seed: luck that both share is in their covariance.
-        variance = _variance_of_mean(of_x + of_y)
+        variance = _variance_of_mean(placements_x + placements_y)
     else:
         raise ValueError(f"paired values must be as many: {x.shape[-1]} and {y.shape[-1]} given")
-    fewest = min(x.shape[-1], y.shape[-1])
+    min_seeds = min(x.shape[-1], y.shape[-1])
     # A variance of 1e-20 or less is rounding.
     estimable = (variance > 1e-20) & (rate > 0) & (rate < 1)
-    estimable &= not paired or enough(fewest, confidence)
+    estimable &= not paired or enough(min_seeds, confidence)
     # A rate of n trials has the variance rate (1 - rate) / n, which is solved for n.
-    trials = np.where(estimable, rate * (1 - rate) / np.where(estimable, variance, 1), fewest)
+    trials = np.where(estimable, rate * (1 - rate) / np.where(estimable, variance, 1), min_seeds)
     return wilson(rate * trials, trials, confidence)
 
 
@@ -108,9 +108,9 @@ def _placements(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     ranks = stats.rankdata(np.concatenate([x, y], axis=-1), axis=-1)
     num_x = x.shape[-1]
     num_y = y.shape[-1]
-    of_x = (ranks[..., :num_x] - stats.rankdata(x, axis=-1)) / num_y
-    of_y = (ranks[..., num_x:] - stats.rankdata(y, axis=-1)) / num_x
-    return of_x, 1 - of_y
+    placements_x = (ranks[..., :num_x] - stats.rankdata(x, axis=-1)) / num_y
+    placements_y = (ranks[..., num_x:] - stats.rankdata(y, axis=-1)) / num_x
+    return placements_x, 1 - placements_y
 
 
 def failures_as_worst(x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
@@ -118,10 +118,10 @@ def failures_as_worst(x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarra
     x = np.asarray(x, float)
     y = np.asarray(y, float)
     values = np.concatenate([x, y], axis=-1)
-    worst = np.min(values, axis=-1, keepdims=True, initial=np.inf, where=np.isfinite(values))
+    worst_value = np.min(values, axis=-1, keepdims=True, initial=np.inf, where=np.isfinite(values))
     # Where all failed, the two are alike, whatever number stands for them.
-    worst = np.where(np.isfinite(worst), worst, 0.0)
-    return np.where(np.isfinite(x), x, worst), np.where(np.isfinite(y), y, worst)
+    worst_value = np.where(np.isfinite(worst_value), worst_value, 0.0)
+    return np.where(np.isfinite(x), x, worst_value), np.where(np.isfinite(y), y, worst_value)
 
 
 def _of_order_one(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -169,12 +169,12 @@ def paired_difference(x: ArrayLike, y: ArrayLike, confidence: float = 0.95) -> D
         low, high = test.confidence_interval(confidence)
     # NaN is the p value of equal differences: all pairs favor the same one, or all are ties.
     num_unequal = np.sum(difference != 0, axis=-1)
-    least = np.minimum(2.0 ** (1 - num_unequal), 1)
-    p_value = np.maximum(np.nan_to_num(np.asarray(test[1])), least)
+    min_p = np.minimum(2.0 ** (1 - num_unequal), 1)
+    p_value = np.maximum(np.nan_to_num(np.asarray(test[1])), min_p)
     # Differences of large returns have the rounding of the returns.
     size = np.max(np.maximum(np.abs(x), np.abs(y)), axis=-1)
-    undefined = alike(difference, size) | (not enough(difference.shape[-1], confidence))
-    low, high = (np.where(undefined, np.nan, end)[()] for end in (low, high))
+    is_undefined = alike(difference, size) | (not enough(difference.shape[-1], confidence))
+    low, high = (np.where(is_undefined, np.nan, end)[()] for end in (low, high))
     return Difference(difference.mean(axis=-1), low, high, p_value[()])
 
 
@@ -203,7 +203,7 @@ def compare_all(values: Sequence[np.ndarray], confidence: float = 0.95) -> list[
     """
     pairs = list(itertools.combinations(range(len(values)), 2))
     differences = [paired_difference(values[i], values[j], confidence=confidence) for i, j in pairs]
-    adjusted = holm([difference.p_value for difference in differences])
+    holm_p_values = holm([difference.p_value for difference in differences])
     return [
         Comparison(
             i,
@@ -211,9 +211,9 @@ def compare_all(values: Sequence[np.ndarray], confidence: float = 0.95) -> list[
             probability_of_improvement(values[i], values[j], paired=True, confidence=confidence),
             Estimate(difference.value, difference.low, difference.high),
             difference.p_value,
-            float(corrected),
+            float(holm_p_value),
         )
-        for (i, j), difference, corrected in zip(pairs, differences, adjusted, strict=True)
+        for (i, j), difference, holm_p_value in zip(pairs, differences, holm_p_values, strict=True)
     ]
 
 
@@ -226,10 +226,10 @@ def holm(p_values: ArrayLike) -> np.ndarray:
     p_values = np.asarray(p_values, float)
     order = np.argsort(p_values)
     scaled = p_values[order] * np.arange(len(p_values), 0, -1)
-    adjusted = np.empty_like(p_values)
+    holm_p_values = np.empty_like(p_values)
     # No p value may come out below that of a pair which is surer.
-    adjusted[order] = np.minimum(np.maximum.accumulate(scaled), 1.0)
-    return adjusted
+    holm_p_values[order] = np.minimum(np.maximum.accumulate(scaled), 1.0)
+    return holm_p_values
 
 
 def seeds_needed(
@@ -254,9 +254,9 @@ def seeds_needed(
     x, y = _of_order_one(*failures_as_worst(x, y))
     if np.mean(x) == np.mean(y):
         return None
-    sufficient = np.flatnonzero(_power_by_seeds(x, y, alpha) >= power)
-    if len(sufficient):
-        return int(sufficient[0]) + 2
+    sufficient_counts = np.flatnonzero(_power_by_seeds(x, y, alpha) >= power)
+    if len(sufficient_counts):
+        return int(sufficient_counts[0]) + 2
     num_seeds = _by_normal_approximation(x, y, power, alpha)
     return num_seeds if num_seeds <= _MOST_SEEDS else None
 
@@ -270,9 +270,9 @@ def _power_by_seeds(x: np.ndarray, y: np.ndarray, alpha: float) -> np.ndarray:
     variances = []
     for values in (x, y):
         # About the middle, so that a sum of squares less a square of sums keeps its digits.
-        drawn = values[random.integers(0, len(values), (_EXPERIMENTS, _DRAWN_SEEDS))] - middle
+        samples = values[random.integers(0, len(values), (_EXPERIMENTS, _DRAWN_SEEDS))] - middle
         # An experiment of n seeds is the first n draws of a row: one set of draws for all n.
-        sums, squares = (np.cumsum(power, axis=1)[:, 1:] for power in (drawn, drawn**2))
+        sums, squares = (np.cumsum(power, axis=1)[:, 1:] for power in (samples, samples**2))
         means.append(sums / count)
         spread = np.maximum(squares - sums**2 / count, 0)
         variances.append(spread / (count - 1) / count)  # of the mean
@@ -283,9 +283,9 @@ def _power_by_seeds(x: np.ndarray, y: np.ndarray, alpha: float) -> np.ndarray:
     # Student's quantile takes long for a million numbers; it is smooth between whole ones.
     degrees = np.arange(1, 2 * _DRAWN_SEEDS)
     freedom = np.where(np.isnan(freedom), 1.0, freedom)  # where nothing varies
-    critical = np.interp(freedom, degrees, stats.t.isf(alpha / 2, degrees))
+    critical_value = np.interp(freedom, degrees, stats.t.isf(alpha / 2, degrees))
     rare_enough = np.array([least_p(n, n) <= alpha for n in count.tolist()])
-    return np.mean(t > critical, axis=0) * rare_enough
+    return np.mean(t > critical_value, axis=0) * rare_enough
 
 
 def _by_normal_approximation(x: np.ndarray, y: np.ndarray, power: float, alpha: float) -> int:
@@ -310,10 +310,10 @@ def wrong_winner(x: ArrayLike, y: ArrayLike, num_seeds: int, draws: int = 10_000
     """
     x, y = _of_order_one(*failures_as_worst(x, y))
     random = np.random.default_rng(0)
-    drawn = [v[random.integers(0, len(v), (draws, num_seeds))] for v in (x, y)]
+    drawn_values = [v[random.integers(0, len(v), (draws, num_seeds))] for v in (x, y)]
     truth = np.sign(np.mean(x) - np.mean(y))
     if not truth:
         return math.nan
     # 1 where the draw agrees, -1 where it does not, 0 without a winner.
-    agreement = np.sign(drawn[0].mean(axis=1) - drawn[1].mean(axis=1)) * truth
+    agreement = np.sign(drawn_values[0].mean(axis=1) - drawn_values[1].mean(axis=1)) * truth
     return float(np.mean(1 - agreement) / 2)

@@ -42,8 +42,8 @@ def time_to_threshold(
     """
     reached = np.isfinite(eval_return) & (eval_return >= threshold)
     solved = np.asarray(reached.any(axis=0))
-    when = np.where(solved, reached.argmax(axis=0), len(reached) - 1)
-    return np.take_along_axis(np.asarray(env_steps), when[None], axis=0)[0], solved
+    solving_index = np.where(solved, reached.argmax(axis=0), len(reached) - 1)
+    return np.take_along_axis(np.asarray(env_steps), solving_index[None], axis=0)[0], solved
 
 
 def collapses(eval_return: np.ndarray, threshold: float) -> np.ndarray:
@@ -106,7 +106,7 @@ def median_steps(steps: ArrayLike, solved: ArrayLike, confidence: float = 0.95) 
     # Where an end is not defined, all seeds are left, or none is. Else it is no fraction, so that
     # rounding decides nothing.
     ends = (np.where(np.isnan(x), curve.probability, x) <= 0.5 for x in (curve.low, curve.high))
-    return Estimate(half, *(_first(curve.steps, below) for below in ends))
+    return Estimate(half, *(_first(curve.steps, is_below) for is_below in ends))
 
 
 def restricted_mean(
@@ -139,12 +139,12 @@ def restricted_mean(
     # The curve is a staircase; clipped, its steps beyond ``until`` have no width.
     edges = np.clip(np.concatenate([[0], survival.quantiles, [until]]), 0, until)
     areas = np.diff(edges) * np.concatenate([[1.0], survival.probabilities])
-    after = np.cumsum(areas[:0:-1])[::-1]  # the area after each of the steps
-    at_risk = np.sum(steps >= survival.quantiles[:, None], axis=1)
+    area_after = np.cumsum(areas[:0:-1])[::-1]  # the area after each of the steps
+    num_at_risk = np.sum(steps >= survival.quantiles[:, None], axis=1)
     events = np.sum(steps[solved] == survival.quantiles[:, None], axis=1)
     # Greenwood's terms. After the last seed the area is 0, and 1 avoids 0 / 0.
-    survivors = at_risk - events
-    terms = after**2 * events / (at_risk * np.where(survivors > 0, survivors, 1))
+    survivors = num_at_risk - events
+    terms = area_after**2 * events / (num_at_risk * np.where(survivors > 0, survivors, 1))
     num_seeds = len(steps)
     value = float(areas.sum())
     if not (enough(num_seeds, confidence) and terms.any()):
@@ -217,14 +217,14 @@ def mean_while_training(eval_return: np.ndarray, env_steps: np.ndarray, until: f
     """
     means = []
     for returns, steps in zip(eval_return.T, np.asarray(env_steps, float).T, strict=True):
-        moved = np.diff(steps, prepend=-1) > 0  # a seed that stands still keeps its value
-        steps = steps[moved]
-        returns = returns[moved]
+        has_moved = np.diff(steps, prepend=-1) > 0  # a seed that stands still keeps its value
+        steps = steps[has_moved]
+        returns = returns[has_moved]
         end = min(max(until, steps[0]), steps[-1])
         # The corners of the curve before the end, and the point at which it is cut off.
-        inside = steps < end
-        corners = np.append(steps[inside], end)
-        heights = np.append(returns[inside], np.interp(end, steps, returns))
+        is_inside = steps < end
+        corners = np.append(steps[is_inside], end)
+        heights = np.append(returns[is_inside], np.interp(end, steps, returns))
         width = corners[-1] - corners[0]
         means.append(np.trapezoid(heights, corners) / width if width else heights[0])
     return np.array(means)

@@ -36,7 +36,7 @@ class Division:
 
     def devices(self) -> Devices:
         """Returns these devices, the first of this process."""
-        return _devices(self.count)
+        return _first_devices(self.count)
 
     def width(self, num_seeds: int) -> int:
         """Returns how many of the seeds a device has at most."""
@@ -48,7 +48,7 @@ class Division:
 
     def jit(
         self,
-        function: Callable[..., Any],
+        program: Callable[..., Any],
         in_specs: tuple[PartitionSpec, ...],
         out_specs: Any,
         *,
@@ -57,48 +57,48 @@ class Division:
         """Returns a compiled function of seeds on these devices.
 
         Args:
-          function: of arrays, of some or all seeds.
+          program: of arrays, of some or all seeds.
           in_specs: which axis of its arguments is that of the seeds.
           out_specs: the same of its result.
           by_episodes: whether it divides episodes itself.
         """
         # On one device nothing is divided, and a program needs no shardings.
         if self.count == 1:
-            return jax.jit(function)
+            return jax.jit(program)
         devices = self.devices()
         # Each device computes its own seeds, and none waits for another.
         if self.seeds > 1:
-            return devices.jit(function, in_specs, out_specs)
+            return devices.jit(program, in_specs, out_specs)
         # All devices get all seeds. A function that divides episodes maps that alone over them;
         # XLA divides what follows from the episodes.
-        replicated = devices.shardings(NONE)
+        replicas = devices.shardings(NONE)
         if by_episodes:
-            shardings = {"in_shardings": replicated, "out_shardings": replicated}
-            return jax.jit(function, **shardings)
-        return devices.jit(function, NONE, NONE)
+            shardings = {"in_shardings": replicas, "out_shardings": replicas}
+            return jax.jit(program, **shardings)
+        return devices.jit(program, NONE, NONE)
 
-    def shapes(self, tree: PyTree, spec: PartitionSpec) -> Any:
+    def shapes(self, shape_tree: PyTree, spec: PartitionSpec) -> Any:
         """Returns the shapes of arrays as ``put`` places them."""
         if self.count == 1:
-            return tree
-        return self.devices().shapes(tree, self._spec(spec))
+            return shape_tree
+        return self.devices().shapes(shape_tree, self._spec(spec))
 
-    def put(self, tree: PyTree, spec: PartitionSpec = RUNS) -> Any:
+    def put(self, array_tree: PyTree, spec: PartitionSpec = RUNS) -> Any:
         """Returns arrays for a function of ``jit``.
 
         Args:
-          tree: arrays.
+          array_tree: arrays.
           spec: RUNS where their first axis is that of the seeds, NONE where none is.
         """
         if self.count == 1:
-            return tree
-        return self.devices().put(tree, self._spec(spec))
+            return array_tree
+        return self.devices().put(array_tree, self._spec(spec))
 
     def _spec(self, spec: PartitionSpec) -> PartitionSpec:
         return spec if self.seeds > 1 else NONE
 
 
-_devices = functools.cache(Devices)
+_first_devices = functools.cache(Devices)
 
 #: One device trains.
 ALONE = Division()

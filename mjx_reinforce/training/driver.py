@@ -60,12 +60,12 @@ class Observer(Generic[DriverT]):
     def began(self, driver: DriverT) -> None:
         """Called before the first update, also of runs that go on."""
 
-    def updated(self, driver: DriverT, met: np.ndarray) -> None:
+    def updated(self, driver: DriverT, num_nonfinite: np.ndarray) -> None:
         """Called after each block of updates.
 
         Args:
           driver: of the runs, after the block.
-          met: [S] how many of the last block met numbers which are not finite, of each seed.
+          num_nonfinite: [S] how many updates of the last block met numbers which are not finite.
         """
 
     def evaluated(self, driver: DriverT, evaluation: Evaluation, rows: Arrays) -> None:
@@ -80,7 +80,7 @@ class Observer(Generic[DriverT]):
 
 #: The host need not look at runs more often than this (s). Between short blocks the devices would
 #: wait for it.
-_SECONDS = 0.25
+_CALL_SECONDS = 0.25
 
 
 def check_layout(checkpoint: Checkpoint, slots: Slots) -> None:
@@ -191,10 +191,10 @@ class Driver:
             start = time.perf_counter()
             active, lengths = self.record.moved()
             blocks = self.slots.advance(active, lengths, evaluate=evaluate, max_blocks=num_blocks)
-            # As many blocks at once as take ``_SECONDS`` at this speed. At most twice as many as
-            # now: while a policy learns, episodes may become longer.
-            timely = len(blocks) * _SECONDS / (time.perf_counter() - start)
-            num_blocks = max(1, min(int(timely), 2 * len(blocks), max_blocks))
+            # As many blocks at once as take ``_CALL_SECONDS`` at this speed. At most twice as many
+            # as now: while a policy learns, episodes may become longer.
+            timely_blocks = len(blocks) * _CALL_SECONDS / (time.perf_counter() - start)
+            num_blocks = max(1, min(int(timely_blocks), 2 * len(blocks), max_blocks))
             self._take(blocks)
 
     def _max_blocks(self) -> int:
@@ -203,18 +203,18 @@ class Driver:
 
     def _take(self, blocks: list[Measured]) -> None:
         """Takes in evaluations and the updates that followed them."""
-        met = np.zeros(0, int)
+        num_nonfinite = np.zeros(0, int)
         for block in blocks:
             # The evaluation is of the policies before the block, so it is recorded before.
             if block.eval_metrics:
                 self._take_evaluation(block)
             if block.metrics:
-                met = self.record.add_updates(block)
+                num_nonfinite = self.record.add_updates(block)
         # All blocks came at once: observers see the last one alone.
         if blocks[0].metrics:
             self._reached = self.seconds()
             for observer in self.observers:
-                observer.updated(self, met)
+                observer.updated(self, num_nonfinite)
 
     def _take_evaluation(self, measured: Measured) -> None:
         """Takes in what the policies before a block return."""
@@ -283,10 +283,10 @@ class RunDriver(Driver):
         # It is of the policies with which the block began.
         actor = self._before.train_states.actor
         num_updates = self._before.train_states.num_updates
-        present = Best(
+        present_best = Best(
             actor=actor, eval_return=eval_metrics["eval_return"], num_updates=num_updates
         )
-        self.best = keep_best(self.best, present)
+        self.best = keep_best(self.best, present_best)
         rows = self.record.add_evaluation(measured, self._reached)
         evaluation = Evaluation(
             updates=counts.to_int(num_updates),
@@ -425,28 +425,28 @@ def env_steps_in(
     """
     max_updates = MAX_COUNT if config.max_updates is None else config.max_updates
     start_time = time.perf_counter()
-    trial = [_Moment.of(0.0, slots)]
+    moments = [_Moment.of(0.0, slots)]
     # Calls of 1, 2, 4, ... updates: nobody knows yet how long one takes, and so the last call is
     # about half of the trial.
-    while trial[-1].seconds < _TRIAL_SHARE * seconds and not (trial[1:] and interrupted()):
-        num_updates = 2 ** (len(trial) - 1)
-        slots.budget = Budget.of(None, min(trial[-1].updates + num_updates, max_updates))
+    while moments[-1].seconds < _TRIAL_SHARE * seconds and not (moments[1:] and interrupted()):
+        num_updates = 2 ** (len(moments) - 1)
+        slots.budget = Budget.of(None, min(moments[-1].updates + num_updates, max_updates))
         if not slots.advance(evaluate=False):
             break  # no seed has an update left
-        trial.append(_Moment.of(time.perf_counter() - start_time, slots))
-    start = trial[0]
-    end = trial[-1]
-    if len(trial) == 1:
+        moments.append(_Moment.of(time.perf_counter() - start_time, slots))
+    start = moments[0]
+    end = moments[-1]
+    if len(moments) == 1:
         return max(1, round(start.env_steps))
     # The last call alone, if no moment before it is in the second half.
-    halfway = next((x for x in trial[1:-1] if x.seconds >= end.seconds / 2), trial[-2])
-    elapsed = end.seconds - halfway.seconds
+    middle = next((x for x in moments[1:-1] if x.seconds >= end.seconds / 2), moments[-2])
+    elapsed = end.seconds - middle.seconds
     # The trial was not evaluated. The run is, after every block, and stands still meanwhile unless
     # evaluations share the launches of updates.
-    block_seconds = config.block_length * elapsed / (end.updates - halfway.updates)
+    block_seconds = config.block_length * elapsed / (end.updates - middle.updates)
     eval_seconds = slots.seconds_to_evaluate()
-    speed = (end.env_steps - halfway.env_steps) / elapsed
-    speed = speed * block_seconds / (block_seconds + eval_seconds)
+    env_steps_per_second = (end.env_steps - middle.env_steps) / elapsed
+    env_steps_per_second = env_steps_per_second * block_seconds / (block_seconds + eval_seconds)
     # The trial took its time, and what it trained is undone: the run goes on from its start.
-    remaining = max(seconds - end.seconds - eval_seconds, 0.0)
-    return min(max(1, round(start.env_steps + speed * remaining)), MAX_COUNT)
+    remaining_seconds = max(seconds - end.seconds - eval_seconds, 0.0)
+    return min(max(1, round(start.env_steps + env_steps_per_second * remaining_seconds)), MAX_COUNT)

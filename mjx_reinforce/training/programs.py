@@ -52,17 +52,17 @@ class Block(NamedTuple):
 
 def block_of_updates(
     build_learner: BuildLearner,
-    length: int,
+    block_length: int,
     make_evaluation: Callable[..., EvaluationEpisodes] | None,
 ) -> Callable[..., tuple[RunState, Block]]:
-    """Returns a function that makes ``length`` updates of all runs, or fewer if that is the end.
+    """Returns a function that makes ``block_length`` updates of all runs, or fewer at the end.
 
     It takes a ``RunState``, a ``Budget``, and whether to evaluate the policies before the first
     update, [] or [R]. Its result is the state, and a ``Block``.
 
     Args:
       build_learner: called while the settings of one run are traced.
-      length: rows of the metrics.
+      block_length: rows of the metrics.
       make_evaluation: (key of an evaluation [], active=whether it is made []) -> its episodes,
         which are played in one launch with those of the first update; None where learners cannot.
     """
@@ -75,24 +75,24 @@ def block_of_updates(
 
         def unfinished(carry: tuple[RunState, Block]) -> jax.Array:
             state, block = carry
-            return (block.num_updates < length) & jnp.any(_active(state, budget))
+            return (block.num_updates < block_length) & jnp.any(_active(state, budget))
 
         def body(carry: tuple[RunState, Block]) -> tuple[RunState, Block]:
             """Makes one update, and writes its metrics as a row."""
             state, (num_updates, rows, eval_metrics) = carry
             state, row, measured = update(state, budget, evaluation_due & (num_updates == 0))
-            write = functools.partial(lax.dynamic_update_index_in_dim, index=num_updates, axis=0)
+            store = functools.partial(lax.dynamic_update_index_in_dim, index=num_updates, axis=0)
             # The first update alone evaluates; what the others return as measured is void.
             eval_metrics = jax.tree.map(
                 lambda x, old: jnp.where(num_updates == 0, x, old), measured, eval_metrics
             )
-            return state, Block(num_updates + 1, jax.tree.map(write, rows, row), eval_metrics)
+            return state, Block(num_updates + 1, jax.tree.map(store, rows, row), eval_metrics)
 
         # The loop writes into arrays of a fixed length: XLA knows no others. Rows after the last
         # update stay zero, so that "active" is False there.
         _, row, eval_metrics = jax.eval_shape(update, state, budget, evaluation_due)
         zeros = functools.partial(jax.tree.map, lambda x: jnp.zeros(x.shape, x.dtype))
-        rows = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), row)
+        rows = jax.tree.map(lambda x: jnp.zeros((block_length, *x.shape), x.dtype), row)
         return lax.while_loop(
             unfinished, body, (state, Block(jnp.int32(0), rows, zeros(eval_metrics)))
         )
@@ -130,11 +130,11 @@ def _update_of_runs(
     def update(state: RunState, budget: Budget, evaluation_due: jax.Array) -> Any:
         """Makes one update of all runs [R] that have budget left; results as of ``step``."""
         # Schedules, such as the learning rate's, go by a share that learners do not know.
-        before = dataclasses.replace(state.train_states, progress=_progress(state, budget))
+        old_states = dataclasses.replace(state.train_states, progress=_progress(state, budget))
         active = _active(state, budget)
         evaluation_due = jnp.broadcast_to(evaluation_due, len(state.eval_keys))
         train_states, metrics, eval_metrics = jax.vmap(step)(
-            before, state.settings, active, state.eval_keys, evaluation_due
+            old_states, state.settings, active, state.eval_keys, evaluation_due
         )
         return dataclasses.replace(state, train_states=train_states), metrics, eval_metrics
 
@@ -143,8 +143,8 @@ def _update_of_runs(
 
 def _active(state: RunState, budget: Budget) -> jax.Array:
     """Returns which runs [R] have not used their budget."""
-    out_of_steps = counts.reached(state.train_states.env_steps, budget.env_steps)
-    return ~(out_of_steps | counts.reached(state.train_states.num_updates, budget.updates))
+    is_out_of_steps = counts.reached(state.train_states.env_steps, budget.env_steps)
+    return ~(is_out_of_steps | counts.reached(state.train_states.num_updates, budget.updates))
 
 
 def _progress(state: RunState, budget: Budget) -> jax.Array:
@@ -246,10 +246,10 @@ def evaluation_metrics(
     # A return that overflowed says nothing, either.
     returns = jnp.where(trajectory.nonfinite | ~jnp.isfinite(returns), jnp.nan, returns)
     modes = evaluation.num_modes
-    stochastic = {}
+    sampled_metrics = {}
     if len(evaluation.keys) > modes:
-        stochastic["eval_return_stochastic"] = jnp.mean(returns[modes:])
-    return stochastic | {
+        sampled_metrics["eval_return_stochastic"] = jnp.mean(returns[modes:])
+    return sampled_metrics | {
         "eval_return": jnp.mean(returns[:modes]),
         "eval_length": jnp.mean(lengths[:modes]),
         "eval_steps": jnp.sum(lengths),
@@ -282,7 +282,7 @@ class Programs(NamedTuple):
 
 
 #: The metrics that say how far a run is, and which of its updates broke.
-_COUNTED = ("active", "env_steps", "nonfinite_episodes", "skipped_update")
+_PROGRESS_METRICS = ("active", "env_steps", "nonfinite_episodes", "skipped_update")
 
 
 def _states_of_runs(build_learner: BuildLearner) -> Callable[..., RunState]:
@@ -292,12 +292,12 @@ def _states_of_runs(build_learner: BuildLearner) -> Callable[..., RunState]:
         return build_learner(settings).init(key)
 
     # One program, whatever the seeds are: a program for each operation on keys takes longer.
-    def states(seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]) -> RunState:
+    def states(seed: Seed, seed_numbers: jax.Array, settings: dict[str, jax.Array]) -> RunState:
         """Returns the states of R runs before their first update."""
-        keys = seed_keys(seed, numbers)
+        keys = seed_keys(seed, seed_numbers)
         return RunState(
             train_states=jax.vmap(first_state)(keys, settings),
-            eval_keys=eval_keys(numbers),
+            eval_keys=eval_keys(seed_numbers),
             settings=settings,
         )
 
@@ -325,7 +325,7 @@ def programs_of(
       num_runs: R, of the shapes; those of one device.
       traced: the names of the settings that differ from run to run.
       all_metrics: whether all is measured that ``metrics.csv`` has. Else evaluations play the
-        policy's mode alone, and of the metrics those of ``_COUNTED`` are returned.
+        policy's mode alone, and of the metrics those of ``_PROGRESS_METRICS`` are returned.
       division: among which devices the runs are divided.
     """
     learner = build_learner({})  # policies and engines are those of any
@@ -336,17 +336,17 @@ def programs_of(
 
     states = _states_of_runs(build_learner)
 
-    def begin(seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]) -> Any:
-        rows = layout.traced_rows(states(seed, numbers, settings))
-        return rows, plain(last_test_keys(numbers, config))
+    def begin(seed: Seed, seed_numbers: jax.Array, settings: dict[str, jax.Array]) -> Any:
+        rows = state_rows.traced_rows(states(seed, seed_numbers, settings))
+        return rows, plain(last_test_keys(seed_numbers, config))
 
-    size: Any = {"num_episodes": config.eval_episodes, "sampled": all_metrics}
-    make_evaluation = functools.partial(evaluation_episodes, **size)
-    play = functools.partial(evaluate, env, learner, horizon=horizon, **size)
+    evaluation_options: Any = {"num_episodes": config.eval_episodes, "sampled": all_metrics}
+    make_evaluation = functools.partial(evaluation_episodes, **evaluation_options)
+    play = functools.partial(evaluate, env, learner, horizon=horizon, **evaluation_options)
 
-    def evaluate_rows(rows: jax.Array, chosen: jax.Array) -> dict[str, jax.Array]:
-        state = layout.traced_states(rows)
-        return jax.vmap(play)(state.train_states.actor, state.eval_keys, active=chosen)
+    def evaluate_rows(rows: jax.Array, is_evaluated: jax.Array) -> dict[str, jax.Array]:
+        state = state_rows.traced_states(rows)
+        return jax.vmap(play)(state.train_states.actor, state.eval_keys, active=is_evaluated)
 
     updates = block_of_updates(
         build_learner, config.block_length, make_evaluation if advance_evaluates else None
@@ -356,18 +356,18 @@ def programs_of(
         rows: jax.Array, budget: Sequence[jax.Array], occupied: jax.Array, evaluation_due: jax.Array
     ) -> Any:
         """Makes a block of updates of rows; those without a run are not ``occupied`` [R]."""
-        before = _stop_empty(layout.traced_states(rows), occupied)
-        after, (_, metrics, eval_metrics) = updates(
-            before, Budget(*budget), occupied & evaluation_due
+        old_states = _stop_empty(state_rows.traced_states(rows), occupied)
+        new_states, (_, metrics, eval_metrics) = updates(
+            old_states, Budget(*budget), occupied & evaluation_due
         )
         # A sweep records no more, and what is returned is fetched of each of its runs.
         if not all_metrics:
-            metrics = {name: metrics[name] for name in _COUNTED}
-        return layout.traced_rows(after), metrics, eval_metrics
+            metrics = {name: metrics[name] for name in _PROGRESS_METRICS}
+        return state_rows.traced_rows(new_states), metrics, eval_metrics
 
-    # The functions above read ``layout`` when they are traced, which is later.
+    # The functions above read ``state_rows`` when they are traced, which is later.
     numbers = jax.ShapeDtypeStruct((num_runs,), np.uint32)
     settings = {name: jax.ShapeDtypeStruct((num_runs,), jnp.result_type(float)) for name in traced}
-    like = jax.eval_shape(states, np.uint32(0), numbers, settings)
-    layout = StateRows(like)
-    return Programs(begin, advance, evaluate_rows, advance_evaluates, like, division)
+    state_shapes = jax.eval_shape(states, np.uint32(0), numbers, settings)
+    state_rows = StateRows(state_shapes)
+    return Programs(begin, advance, evaluate_rows, advance_evaluates, state_shapes, division)

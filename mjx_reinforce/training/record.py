@@ -52,19 +52,19 @@ COLUMNS = (
 )
 HEADER = (",".join(COLUMNS) + "\n").encode()
 #: What these columns are called among the metrics of an update.
-_RENAMED = {"train_return": "episode_return", "train_length": "episode_length"}
+_METRIC_OF_COLUMN = {"train_return": "episode_return", "train_length": "episode_length"}
 
 
 def as_rows(measured: Arrays, seconds: float) -> Arrays:
     """Returns the rows of one evaluation in metrics.csv: column -> the values [S] of all seeds.
 
     Args:
-      measured: [S] each, by column, or as ``_RENAMED``. What was not measured is no column. A
-        return is NaN if one of its episodes was not finite.
+      measured: [S] each, by column, or as ``_METRIC_OF_COLUMN``. What was not measured is no
+        column. A return is NaN if one of its episodes was not finite.
       seconds: wall time since compilation ended.
     """
     clock = np.full(len(measured["seed"]), round(seconds, 3))
-    columns = {column: measured.get(_RENAMED.get(column, column)) for column in COLUMNS}
+    columns = {column: measured.get(_METRIC_OF_COLUMN.get(column, column)) for column in COLUMNS}
     return {n: x for n, x in columns.items() if x is not None} | {"wall_seconds": clock}
 
 
@@ -86,17 +86,17 @@ def _cells(values: np.ndarray) -> Sequence[str]:
 
 
 #: The time left is estimated from so many of the latest evaluations: episodes change their length.
-_LATEST = 11
+_NUM_LATEST = 11
 
 
 def used(config: Config, env_steps: np.ndarray, updates: np.ndarray) -> np.ndarray:
     """Returns the fraction of its budget that each seed has used, of counts [..., S]."""
-    fraction = np.zeros(env_steps.shape)
+    budget_share = np.zeros(env_steps.shape)
     if config.env_steps is not None:
-        fraction = env_steps / config.env_steps
+        budget_share = env_steps / config.env_steps
     if config.max_updates is not None:
-        fraction = np.maximum(fraction, updates / config.max_updates)
-    return fraction
+        budget_share = np.maximum(budget_share, updates / config.max_updates)
+    return budget_share
 
 
 class Progress(NamedTuple):
@@ -131,9 +131,9 @@ HOPELESS = (
 )
 #: A run is not given up before each of its seeds was broken so many updates in a row: blocks may
 #: be shorter, and a seed may recover from one such update, since the next draws other numbers.
-_FEWEST = 5
+_MIN_BROKEN = 5
 #: A message names so many seeds.
-_NAMED = 5
+_MAX_NAMED = 5
 
 
 def nonfinite_updates(metrics: Arrays) -> np.ndarray:
@@ -142,53 +142,54 @@ def nonfinite_updates(metrics: Arrays) -> np.ndarray:
     Args:
       metrics: [K, S] each, as in ``Measured``.
     """
-    broken = (metrics["nonfinite_episodes"] > 0) | (metrics["skipped_update"] > 0)
-    return (broken & metrics["active"]).sum(axis=0)
+    is_broken = (metrics["nonfinite_episodes"] > 0) | (metrics["skipped_update"] > 0)
+    return (is_broken & metrics["active"]).sum(axis=0)
 
 
-def broken_in_a_row(before: np.ndarray, metrics: Arrays) -> np.ndarray:
+def broken_in_a_row(old_count: np.ndarray, metrics: Arrays) -> np.ndarray:
     """Returns how many of its latest updates each seed was broken in, without one between.
 
     An update is broken if all its episodes left the finite numbers, or if it was skipped.
 
     Args:
-      before: [S] the same before this block.
+      old_count: [S] the same before this block.
       metrics: [K, S] each, as in ``Measured``.
     """
-    broken = metrics["nonfinite_episodes"] >= metrics["episodes"]
-    broken |= metrics["skipped_update"] > 0
-    count = before
+    is_broken = metrics["nonfinite_episodes"] >= metrics["episodes"]
+    is_broken |= metrics["skipped_update"] > 0
+    num_broken = old_count
     # One row [S] an update. A seed that stands still keeps its count: it was not tried.
-    for active_row, broken_row in zip(metrics["active"], broken, strict=True):
-        count = np.where(active_row, np.where(broken_row, count + 1, 0), count)
-    return count
+    for active_row, is_broken_row in zip(metrics["active"], is_broken, strict=True):
+        num_broken = np.where(active_row, np.where(is_broken_row, num_broken + 1, 0), num_broken)
+    return num_broken
 
 
-def describe_nonfinite(met: np.ndarray, first_seed: int, updates: int) -> str:
+def describe_nonfinite(num_nonfinite: np.ndarray, first_seed: int, updates: int) -> str:
     """Returns a line about the first ``nonfinite_updates`` of a run, of which some are not 0.
 
     Args:
-      met: [S] how many of a block, of each seed.
+      num_nonfinite: [S] how many of a block, of each seed.
       first_seed: the number of the first seed.
       updates: how many there were after the block.
     """
-    seeds = (first_seed + np.flatnonzero(met)).tolist()
-    numbers = ", ".join(map(str, seeds[:_NAMED]))
-    if len(seeds) > _NAMED:
-        numbers += ", ..."
+    seeds = (first_seed + np.flatnonzero(num_nonfinite)).tolist()
+    seed_list = ", ".join(map(str, seeds[:_MAX_NAMED]))
+    if len(seeds) > _MAX_NAMED:
+        seed_list += ", ..."
     noun = "number" if len(seeds) == 1 else "numbers"
     return (
-        f"up to update {updates}, {len(seeds):,} of {len(met):,} seeds ({noun} {numbers}) met "
-        "values that are not finite or beyond 1e10. Such an episode counts as the worst of its "
-        "update. This line comes once; the number of such updates comes at the end. If they are "
-        "many, give the model a smaller timestep or more armature, or lower --learning-rate"
+        f"up to update {updates}, {len(seeds):,} of {len(num_nonfinite):,} seeds ({noun} "
+        f"{seed_list}) met values that are not finite or beyond 1e10. Such an episode counts as "
+        "the worst of its update. This line comes once; the number of such updates comes at the "
+        "end. If they are many, give the model a smaller timestep or more armature, or lower "
+        "--learning-rate"
     )
 
 
-def _joined(pieces: Sequence[Arrays]) -> Arrays:
+def _joined(tables: Sequence[Arrays]) -> Arrays:
     """Returns the rows of all pieces of a table, in order."""
-    names = pieces[0] if pieces else ()
-    return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
+    names = tables[0] if tables else ()
+    return {name: np.concatenate([table[name] for table in tables]) for name in names}
 
 
 class Record:
@@ -220,25 +221,25 @@ class Record:
 
     def arrays(self) -> Arrays:
         """Returns all that was measured, by name, for ``restore``."""
-        arrays = {name: np.array(getattr(self, name)) for name in self._saved}
+        record_arrays = {name: np.array(getattr(self, name)) for name in self._saved}
         for table in self._tables:
-            arrays |= {f"{table}.{name}": x for name, x in self._columns(table).items()}
-        return arrays
+            record_arrays |= {f"{table}.{name}": x for name, x in self._columns(table).items()}
+        return record_arrays
 
-    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+    def restore(self, saved: Mapping[str, np.ndarray]) -> None:
         """Goes back to what a record of the same settings had measured.
 
         Args:
-          arrays: from its ``arrays``.
+          saved: from its ``arrays``.
         """
         # Counts change in place, so they are copied; without an axis they were Python's ints.
         for name in self._saved:
-            values = arrays[name]
-            setattr(self, name, values.copy() if values.ndim else values.item())
+            saved_array = saved[name]
+            setattr(self, name, saved_array.copy() if saved_array.ndim else saved_array.item())
         # A table that had no rows has no columns, either.
         for table in self._tables:
-            start = f"{table}."
-            columns = {n.removeprefix(start): x for n, x in arrays.items() if n.startswith(start)}
+            prefix = f"{table}."
+            columns = {n.removeprefix(prefix): x for n, x in saved.items() if n.startswith(prefix)}
             self._tables[table] = [columns] if columns else []
 
     def _columns(self, table: str) -> Arrays:
@@ -307,34 +308,34 @@ class Record:
         """Takes in a block of updates; returns what ``nonfinite_updates`` does."""
         runs, metrics, _ = measured
         active = metrics["active"]
-        met = nonfinite_updates(metrics)
+        num_nonfinite = nonfinite_updates(metrics)
         self.updates[runs] += active.sum(axis=0)
-        steps = np.where(active, metrics["env_steps"], 0)
-        self.env_steps[runs] += steps.sum(axis=0, dtype=np.int64)
-        self.nonfinite[runs] += met
-        return met
+        update_env_steps = np.where(active, metrics["env_steps"], 0)
+        self.env_steps[runs] += update_env_steps.sum(axis=0, dtype=np.int64)
+        self.nonfinite[runs] += num_nonfinite
+        return num_nonfinite
 
     def moved(self) -> tuple[np.ndarray | None, np.ndarray | None]:
         """Returns which runs [R] have not used their budget, and how long their episodes are."""
         return self.used() < 1.0, self.lengths
 
     def progress_at(
-        self, fraction: float, seconds: float, gained: float, passed: float
+        self, fraction: float, seconds: float, gained_fraction: float, seconds_passed: float
     ) -> Progress:
         """Returns how far the runs are.
 
         Args:
           fraction: how much of their budgets they have used.
           seconds: in which they did that.
-          gained: how much of the fraction was new, for an estimate of the time left.
-          passed: seconds in which that came.
+          gained_fraction: how much of the fraction was new, for an estimate of the time left.
+          seconds_passed: seconds in which that came.
         """
         env_steps_per_second = math.nan
         if seconds > 0:
             env_steps_per_second = float(self.env_steps.sum() / seconds)
         seconds_left = math.nan
-        if gained > 0:
-            seconds_left = (1 - fraction) * passed / gained
+        if gained_fraction > 0:
+            seconds_left = (1 - fraction) * seconds_passed / gained_fraction
         return Progress(
             fraction=fraction,
             updates=int(self.updates.max()),
@@ -352,8 +353,8 @@ class Record:
 
         That is ``eval_return``, the ``env_steps`` until then and, of a run, ``episodes``.
         """
-        past = self._columns("evaluations")
-        return {n: past[n] for n in ("eval_return", "env_steps", "episodes") if n in past}
+        table = self._columns("evaluations")
+        return {n: table[n] for n in ("eval_return", "env_steps", "episodes") if n in table}
 
 
 class RunRecord(Record):
@@ -405,18 +406,18 @@ class RunRecord(Record):
         """
         metrics = measured.metrics
         active = metrics["active"]
-        finite = metrics["nonfinite_episodes"] == 0
-        returns = np.where(finite, metrics["episode_return"], np.nan)
+        is_finite = metrics["nonfinite_episodes"] == 0
+        returns = np.where(is_finite, metrics["episode_return"], np.nan)
         episodes = active * metrics["episodes"]
-        training = {
+        training_sums = {
             "episode_return": np.where(active, returns, np.nan),
             "env_steps": self.env_steps + np.cumsum(metrics["env_steps"], axis=0, dtype=np.int64),
             "episodes": self.episodes + np.cumsum(episodes, axis=0, dtype=np.int64),
         }
         # The last block may end early: rows in which no seed made an update are none.
         updates = active.any(axis=1)
-        self._tables["training"].append({name: x[updates] for name, x in training.items()})
-        self.episodes = training["episodes"][-1]
+        self._tables["training"].append({name: x[updates] for name, x in training_sums.items()})
+        self.episodes = training_sums["episodes"][-1]
         self.simulated += _sum(metrics["simulated_steps"])
         self.broken_in_a_row = broken_in_a_row(self.broken_in_a_row, metrics)
         self._remember(metrics | {"episode_return": returns})
@@ -427,11 +428,15 @@ class RunRecord(Record):
         # A seed makes its updates first and then stands still, so their count is the row after the
         # last one.
         num_updates = metrics["active"].sum(axis=0)
-        last = np.maximum(num_updates - 1, 0)[None]
-        newest = {name: np.take_along_axis(x, last, axis=0) for name, x in metrics.items()}
-        old = self._columns("last") or newest
-        moved = num_updates > 0
-        self._tables["last"] = [{n: np.where(moved, x, old[n]) for n, x in newest.items()}]
+        last_index = np.maximum(num_updates - 1, 0)[None]
+        newest_metrics = {
+            name: np.take_along_axis(x, last_index, axis=0) for name, x in metrics.items()
+        }
+        old_metrics = self._columns("last") or newest_metrics
+        has_moved = num_updates > 0
+        self._tables["last"] = [
+            {n: np.where(has_moved, x, old_metrics[n]) for n, x in newest_metrics.items()}
+        ]
 
     def add_evaluation(self, measured: Measured, seconds: float) -> Arrays:
         """Takes in an evaluation [S] of the present policies of all seeds.
@@ -452,24 +457,26 @@ class RunRecord(Record):
         # Columns of metrics.csv are singular: a row is of one update of one seed.
         seeds = self.config.first_seed + np.arange(len(self.updates))
         counts |= {"seed": seeds, "update": self.updates}
-        last = {name: x[0] for name, x in self._columns("last").items()}
-        return as_rows(last | eval_metrics | counts, seconds)
+        last_metrics = {name: x[0] for name, x in self._columns("last").items()}
+        return as_rows(last_metrics | eval_metrics | counts, seconds)
 
     def progress(self) -> Progress:
         """Returns how far the run is, right after an evaluation."""
         names = ("env_steps", "updates", "seconds")
         # A piece may have one row or all of the past: each is cut, then they are joined and cut.
-        pieces = self._tables["evaluations"][-_LATEST:]
-        joined = _joined([{name: piece[name][-_LATEST:] for name in names} for piece in pieces])
-        latest = {name: x[-_LATEST:] for name, x in joined.items()}
-        fractions = used(self.config, latest["env_steps"], latest["updates"])
-        fractions = np.minimum(fractions, 1.0).mean(axis=-1).tolist()
-        seconds = latest["seconds"].tolist()
+        tables = self._tables["evaluations"][-_NUM_LATEST:]
+        latest_columns = _joined(
+            [{name: table[name][-_NUM_LATEST:] for name in names} for table in tables]
+        )
+        latest_rows = {name: x[-_NUM_LATEST:] for name, x in latest_columns.items()}
+        budget_shares = used(self.config, latest_rows["env_steps"], latest_rows["updates"])
+        budget_shares = np.minimum(budget_shares, 1.0).mean(axis=-1).tolist()
+        seconds = latest_rows["seconds"].tolist()
         return self.progress_at(
-            fraction=fractions[-1],
+            fraction=budget_shares[-1],
             seconds=seconds[-1],
-            gained=fractions[-1] - fractions[0],
-            passed=seconds[-1] - seconds[0],
+            gained_fraction=budget_shares[-1] - budget_shares[0],
+            seconds_passed=seconds[-1] - seconds[0],
         )
 
     def count_steps(self, eval_metrics: Arrays) -> None:
@@ -483,9 +490,9 @@ class RunRecord(Record):
 
     def hopeless(self) -> bool:
         """Returns whether all seeds that still train were broken throughout a block of updates."""
-        training = self.used() < 1.0
-        fewest = max(self.config.eval_every, _FEWEST)
-        return bool(training.any() and np.all(self.broken_in_a_row[training] >= fewest))
+        is_training = self.used() < 1.0
+        min_broken = max(self.config.eval_every, _MIN_BROKEN)
+        return bool(is_training.any() and np.all(self.broken_in_a_row[is_training] >= min_broken))
 
     def training(self) -> Arrays:
         """Returns ``episode_return`` and the ``env_steps`` and ``episodes`` after it, [U, S].
@@ -518,6 +525,6 @@ class RunRecord(Record):
         }
 
 
-def _sum(steps: np.ndarray) -> int:
+def _sum(step_counts: np.ndarray) -> int:
     """Returns the sum of counts that may be too many for their own type."""
-    return int(steps.sum(dtype=np.int64))
+    return int(step_counts.sum(dtype=np.int64))

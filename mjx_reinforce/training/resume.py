@@ -27,9 +27,9 @@ from mjx_reinforce.settings.declare import MAX_COUNT, Mark
 #: What may change when a run goes on: when it ends, and how often it is saved.
 BUDGETS = marked(Mark.BUDGET)
 #: Settings that say where a run is, not what it does.
-PLACES = marked(Mark.PLACE)
+PLACE_SETTINGS = marked(Mark.PLACE)
 #: Entries of config.json on which every number of a run depends, besides its settings.
-_PROGRAM = (
+_DECISIVE_ENTRIES = (
     "packages",
     "git_commit",
     "device",
@@ -41,13 +41,13 @@ _PROGRAM = (
     "xla_flags",
 )
 #: Entries that no number depends on.
-_NOT_DECISIVE = ("python", "num_devices", "cpu_count", "resumed")
-_DEVICES = "--xla_force_host_platform_device_count"
-_UNREADABLE = "damaged, or of another version of the program; resume with the version that wrote it"
+_OTHER_ENTRIES = ("python", "num_devices", "cpu_count", "resumed")
+_DEVICES_FLAG = "--xla_force_host_platform_device_count"
+_DAMAGE = "damaged, or of another version of the program; resume with the version that wrote it"
 
 
 #: The first file of a run, and that of a sweep.
-BEGUN = ("config.json", "sweep.json")
+FIRST_FILES = ("config.json", "sweep.json")
 
 
 def read_record(directory: Path) -> dict[str, Any]:
@@ -56,7 +56,7 @@ def read_record(directory: Path) -> dict[str, Any]:
     Raises:
       ValueError: it is not there, or it is damaged.
     """
-    for name in BEGUN:
+    for name in FIRST_FILES:
         try:
             return read_json(directory / name)
         except ValueError as error:
@@ -64,31 +64,33 @@ def read_record(directory: Path) -> dict[str, Any]:
             if not isinstance(error.__cause__, FileNotFoundError):
                 raise
     raise ValueError(
-        f"cannot resume {directory}: there is no {' or '.join(BEGUN)}, so nothing was begun "
+        f"cannot resume {directory}: there is no {' or '.join(FIRST_FILES)}, so nothing was begun "
         "there; start it anew with --output"
     )
 
 
-def as_config(recorded: Mapping[str, Any], path: Path) -> Config:
+def as_config(record: Mapping[str, Any], path: Path) -> Config:
     """Returns the settings that a file recorded, or raises ValueError, which names the file."""
-    types = {f.name: f.type for f in dataclasses.fields(Config) if f.name not in PLACES}
-    recorded_names = recorded.keys() - {*_PROGRAM, *_NOT_DECISIVE, *PLACES}
+    setting_types = {
+        f.name: f.type for f in dataclasses.fields(Config) if f.name not in PLACE_SETTINGS
+    }
+    recorded_names = record.keys() - {*_DECISIVE_ENTRIES, *_OTHER_ENTRIES, *PLACE_SETTINGS}
     # Neither a setting too many nor one too few: a default of today may not be that of then.
-    if mismatched := sorted(recorded_names ^ types.keys()):
-        raise ValueError(f"{path} has other settings ({mismatched[0]}): it is {_UNREADABLE}")
+    if mismatched_names := sorted(recorded_names ^ setting_types.keys()):
+        raise ValueError(f"{path} has other settings ({mismatched_names[0]}): it is {_DAMAGE}")
     settings: dict[str, Any] = {}
-    for name, annotation in types.items():
-        value = recorded[name]
+    for name, annotation in setting_types.items():
+        value = record[name]
         # JSON has no tuples, and no setting is a list.
         settings[name] = tuple(value) if isinstance(value, list) else value
         if not fits(settings[name], annotation):
-            raise ValueError(f"{path} says {name} is {value!r}: it is {_UNREADABLE}")
+            raise ValueError(f"{path} says {name} is {value!r}: it is {_DAMAGE}")
     return Config(**settings)
 
 
 def recordable(config: Config) -> dict[str, Any]:
     """Returns the settings as config.json has them, except where the run is."""
-    settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in PLACES}
+    settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in PLACE_SETTINGS}
     return json.loads(json.dumps(settings))
 
 
@@ -108,13 +110,13 @@ def check_settings(recorded: Config, requested: Config) -> None:
         raise ValueError("--resume goes on in the run's own directory: leave --output out")
     if requested.like is not None:
         raise ValueError("--resume goes on with the run's own settings: leave --like out")
-    for field in dataclasses.fields(Config):
-        old = getattr(recorded, field.name)
-        new = getattr(requested, field.name)
-        if old != new and field.name not in (*BUDGETS, *PLACES):
+    for setting in dataclasses.fields(Config):
+        recorded_value = getattr(recorded, setting.name)
+        requested_value = getattr(requested, setting.name)
+        if recorded_value != requested_value and setting.name not in (*BUDGETS, *PLACE_SETTINGS):
             raise ValueError(
-                f"{flag(field.name)} is {old} in {recorded.resume} and cannot become {new}: only "
-                "its budget may change; leave it out, or start another run"
+                f"{flag(setting.name)} is {recorded_value} in {recorded.resume} and cannot become "
+                f"{requested_value}: only its budget may change; leave it out, or start another run"
             )
 
 
@@ -128,8 +130,8 @@ def is_done(recorded: Config, requested: Config) -> bool:
     """
     assert recorded.resume is not None
     # How often a run is saved decides nothing of where it ends.
-    ends = (name for name in BUDGETS if name != "checkpoint_every")
-    if any(getattr(recorded, name) != getattr(requested, name) for name in ends):
+    budget_names = (name for name in BUDGETS if name != "checkpoint_every")
+    if any(getattr(recorded, name) != getattr(requested, name) for name in budget_names):
         return False
     # A run without a summary, or with a damaged one, did not get to its end.
     try:
@@ -144,43 +146,47 @@ def is_done(recorded: Config, requested: Config) -> bool:
 
 
 def check_same_program(
-    directory: Path, recorded: Mapping[str, Any], present: Mapping[str, Any]
+    directory: Path, record: Mapping[str, Any], present_record: Mapping[str, Any]
 ) -> None:
     """Raises ValueError if a run or a sweep was begun by a program whose numbers may differ.
 
     Args:
       directory: of the run, for the message.
-      recorded: what a file in it says of the program that began it.
-      present: what ``provenance`` returns.
+      record: what a file in it says of the program that began it.
+      present_record: what ``provenance`` returns.
     """
-    for name in (name for name in _PROGRAM if name in present):
-        old = recorded.get(name)
-        new = present[name]
+    for name in (name for name in _DECISIVE_ENTRIES if name in present_record):
+        old_entry = record.get(name)
+        new_entry = present_record[name]
         if name == "xla_flags":
-            old = _without_devices(old)
-            new = _without_devices(new)
+            old_entry = _without_devices(old_entry)
+            new_entry = _without_devices(new_entry)
         # Of versions and JAX's settings the message names the first one that differs.
-        if isinstance(old, dict) and isinstance(new, dict):
-            changed_keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+        if isinstance(old_entry, dict) and isinstance(new_entry, dict):
+            changed_keys = [
+                key
+                for key in {**old_entry, **new_entry}
+                if old_entry.get(key) != new_entry.get(key)
+            ]
             if changed_keys:
                 name = changed_keys[0]
-                old = old.get(name)
-                new = new.get(name)
-        if old != new:
+                old_entry = old_entry.get(name)
+                new_entry = new_entry.get(name)
+        if old_entry != new_entry:
             raise ValueError(
-                f"{directory} was begun with {name} {old}, and here it is {new}, so its numbers "
-                "would change; resume where it was begun, or start another run"
+                f"{directory} was begun with {name} {old_entry}, and here it is {new_entry}, so "
+                "its numbers would change; resume where it was begun, or start another run"
             )
 
 
 def _without_devices(flags: object) -> str:
     """Returns XLA_FLAGS without the number of a CPU's devices, with which a run may go on."""
     words = str(flags or "").split()
-    return " ".join(word for word in words if not word.startswith(f"{_DEVICES}="))
+    return " ".join(word for word in words if not word.startswith(f"{_DEVICES_FLAG}="))
 
 
 _NUM_NEWEST = 2
-_NAME = re.compile(r"\d{6,}-(even-)?[0-9a-f]{16}\.npz")
+_FILE_NAME = re.compile(r"\d{6,}-(even-)?[0-9a-f]{16}\.npz")
 
 
 class Checkpoint(NamedTuple):
@@ -218,22 +224,22 @@ class Checkpoint(NamedTuple):
         return bool(np.all(updates == updates[0]) and updates[0] % eval_every == 0)
 
 
-def save(folder: Path, checkpoint: Checkpoint, *, even: bool) -> None:
+def save(folder: Path, checkpoint: Checkpoint, *, is_even: bool) -> None:
     """Writes a checkpoint beside those that are there, and removes what it makes superfluous.
 
     Args:
       folder: made if it does not exist.
       checkpoint: what is written.
-      even: what ``is_even`` says.
+      is_even: what ``is_even`` says.
 
     Raises:
       OSError: it cannot be written; those that are there stay.
     """
     folder.mkdir(exist_ok=True)
-    content = _encode(checkpoint)
+    archive_bytes = _encode(checkpoint)
     number = max((_number(path) for path in _archives(folder)), default=0) + 1
-    name = f"{number:06d}-{'even-' if even else ''}{_digest(content)}.npz"
-    write_bytes(folder / name, content)
+    name = f"{number:06d}-{'even-' if is_even else ''}{_digest(archive_bytes)}.npz"
+    write_bytes(folder / name, archive_bytes)
     # Two, in case the newest one is damaged. The even one is what a larger budget goes on from.
     paths = _archives(folder)
     live_paths = paths[:_NUM_NEWEST] + [path for path in paths if "-even-" in path.name][:1]
@@ -253,18 +259,18 @@ def read_checkpoints(folder: Path, say: Callable[[str], None]) -> Iterator[Check
       ValueError: a checkpoint is undamaged, but of another version of the program.
     """
     for path in _archives(folder):
-        content = _read(path)
-        if content is None:
+        archive_bytes = _read(path)
+        if archive_bytes is None:
             say(f"checkpoint {path.name} is damaged; trying the one before")
         else:
-            yield _decode(content, path)
+            yield _decode(archive_bytes, path)
 
 
-def remove_checkpoints(folder: Path, after: int = 0) -> None:
+def remove_checkpoints(folder: Path, last_number: int = 0) -> None:
     """Removes the checkpoints after a number, leftovers of writing, and a folder left empty."""
-    unfinished = folder.glob(".*.npz.*")
-    later = (path for path in _archives(folder) if _number(path) > after)
-    for path in [*unfinished, *later]:
+    temporary_paths = folder.glob(".*.npz.*")
+    later_paths = (path for path in _archives(folder) if _number(path) > last_number)
+    for path in [*temporary_paths, *later_paths]:
         path.unlink()
     # A folder with checkpoints in it stays: ``rmdir`` refuses.
     with contextlib.suppress(OSError):
@@ -274,52 +280,54 @@ def remove_checkpoints(folder: Path, after: int = 0) -> None:
 def _archives(folder: Path) -> list[Path]:
     """Returns the checkpoints in a folder, the newest first."""
     paths = folder.iterdir() if folder.is_dir() else ()
-    return sorted(filter(lambda path: _NAME.fullmatch(path.name), paths), key=_number, reverse=True)
+    return sorted(
+        filter(lambda path: _FILE_NAME.fullmatch(path.name), paths), key=_number, reverse=True
+    )
 
 
 def _number(path: Path) -> int:
     return int(path.name.partition("-")[0])
 
 
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()[:16]
+def _digest(archive_bytes: bytes) -> str:
+    return hashlib.sha256(archive_bytes).hexdigest()[:16]
 
 
 def _read(path: Path) -> bytes | None:
     """Returns the contents of a checkpoint, or None if they are not those that were written."""
     try:
-        content = path.read_bytes()
-        check_archive(io.BytesIO(content), stored=True)
+        archive_bytes = path.read_bytes()
+        check_archive(io.BytesIO(archive_bytes), stored=True)
     except (OSError, ValueError, zipfile.BadZipFile):
         return None
-    return content if _digest(content) == path.stem.rpartition("-")[2] else None
+    return archive_bytes if _digest(archive_bytes) == path.stem.rpartition("-")[2] else None
 
 
 #: The fields that are arrays of their own.
-_ROWS = ("states", "best")
+_ROW_FIELDS = ("states", "best")
 
 
 def _encode(checkpoint: Checkpoint) -> bytes:
     """Returns a NumPy archive: the rows, the record's arrays, and the rest as JSON."""
-    fields = checkpoint._asdict()
-    record = {f"record/{name}": values for name, values in fields.pop("record").items()}
-    rows = {name: fields.pop(name) for name in _ROWS}
-    del fields["number"]  # it is in the file's name
+    json_fields = checkpoint._asdict()
+    record = {f"record/{name}": values for name, values in json_fields.pop("record").items()}
+    rows = {name: json_fields.pop(name) for name in _ROW_FIELDS}
+    del json_fields["number"]  # it is in the file's name
     archive = io.BytesIO()
-    np.savez(archive, allow_pickle=False, rest=np.array(json.dumps(fields)), **rows, **record)
+    np.savez(archive, allow_pickle=False, rest=np.array(json.dumps(json_fields)), **rows, **record)
     return archive.getvalue()
 
 
-def _decode(content: bytes, path: Path) -> Checkpoint:
+def _decode(archive_bytes: bytes, path: Path) -> Checkpoint:
     """Reads what ``_encode`` returned; see ``read_checkpoints``."""
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        fields = json.loads(str(arrays.pop("rest")))
-        rows = {name: arrays.pop(name) for name in _ROWS}
-        record = {name.removeprefix("record/"): x for name, x in arrays.items()}
+        with np.load(io.BytesIO(archive_bytes), allow_pickle=False) as archive:
+            archive_arrays = {name: archive[name] for name in archive.files}
+        json_fields = json.loads(str(archive_arrays.pop("rest")))
+        rows = {name: archive_arrays.pop(name) for name in _ROW_FIELDS}
+        record = {name.removeprefix("record/"): x for name, x in archive_arrays.items()}
         # Another version's fields are no arguments of this class: TypeError.
-        return Checkpoint(record=record, number=_number(path), **rows, **fields)
+        return Checkpoint(record=record, number=_number(path), **rows, **json_fields)
     except (KeyError, TypeError, zipfile.BadZipFile, ValueError) as error:
         raise ValueError(
             f"{path} does not fit this version of the program ({error}); "
@@ -342,7 +350,7 @@ def newest_checkpoint(config: Config, say: Callable[[str], None]) -> Checkpoint 
         config = dataclasses.replace(config, env_steps=MAX_COUNT)
     assert config.resume is not None
     metrics = config.resume / "metrics.csv"
-    length = metrics.stat().st_size if metrics.exists() else 0
+    num_bytes = metrics.stat().st_size if metrics.exists() else 0
     settings = decisive(config)
     for checkpoint in read_checkpoints(config.resume / "checkpoint", say):
         # config.json is a file that people edit; a checkpoint is not.
@@ -353,7 +361,7 @@ def newest_checkpoint(config: Config, say: Callable[[str], None]) -> Checkpoint 
                     f"the run was trained with {value}; put that back, or start another run"
                 )
         # Rows are cut off down to a checkpoint's length; rows that are lost cannot come back.
-        if checkpoint.metrics_bytes > length:
+        if checkpoint.metrics_bytes > num_bytes:
             say(
                 f"metrics.csv is shorter than at checkpoint {checkpoint.number}; trying the one "
                 "before"

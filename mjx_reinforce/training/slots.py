@@ -31,27 +31,29 @@ from mjx_reinforce.training.record import Measured
 from mjx_reinforce.training.state import Budget, RunState, StateRows, shape_of_all
 
 
-def pack_slots(chosen: np.ndarray, lengths: np.ndarray, width: int, num_devices: int) -> np.ndarray:
+def pack_slots(
+    is_packed: np.ndarray, episode_lengths: np.ndarray, width: int, num_devices: int
+) -> np.ndarray:
     """Returns the runs of each slot.
 
     Args:
-      chosen: [R] which runs are packed, at least one.
-      lengths: [R] about how long their episodes are; runs of equal lengths share a slot.
+      is_packed: [R] which runs are packed, at least one.
+      episode_lengths: [R] about how long their episodes are; runs of equal lengths share a slot.
       width: of a slot, a multiple of the number of devices.
       num_devices: among which a slot is divided; each gets as many runs as the others, or one less.
 
     Returns:
       [slots, width], the number of the run in each place, -1 where there is none.
     """
-    runs = np.flatnonzero(chosen)
+    runs = np.flatnonzero(is_packed)
     # A slot takes as long as its longest episode: runs of about equal lengths share one.
-    runs = runs[np.argsort(lengths[runs], kind="stable")]
+    runs = runs[np.argsort(episode_lengths[runs], kind="stable")]
     slots = np.full((-(-len(runs) // width), width), -1)
     slots.flat[: len(runs)] = runs
     # A device has a contiguous share of a slot. Runs are dealt to the devices in turn, so that the
     # empty places of the last slot are not all of one device.
-    by_device = slots.reshape(len(slots), width // num_devices, num_devices)
-    return by_device.swapaxes(1, 2).reshape(slots.shape)
+    runs_of_devices = slots.reshape(len(slots), width // num_devices, num_devices)
+    return runs_of_devices.swapaxes(1, 2).reshape(slots.shape)
 
 
 @dataclasses.dataclass
@@ -119,12 +121,14 @@ class Slots:
     layout: what is in a row of its states
     """
 
-    def __init__(self, compiled: Compiled, numbers: np.ndarray, settings: Arrays | None = None):
+    def __init__(
+        self, compiled: Compiled, seed_numbers: np.ndarray, settings: Arrays | None = None
+    ):
         """Begins with the first states.
 
         Args:
           compiled: the programs.
-          numbers: [R] of the runs' seeds.
+          seed_numbers: [R] of the runs' seeds.
           settings: [R] each, those that differ from run to run, if any do.
         """
         programs = compiled.programs
@@ -134,24 +138,24 @@ class Slots:
         self._division = division
         self.layout = StateRows(programs.like)
         self.budget = Budget.of(compiled.config.env_steps, compiled.config.max_updates)
-        width = compiled.width
-        count = len(numbers)
+        slot_width = compiled.width
+        num_runs = len(seed_numbers)
         dtype = jnp.result_type(float)
         settings = {name: values.astype(dtype) for name, values in (settings or {}).items()}
         seed = division.put(np.uint32(compiled.config.seed), NONE)
         first_slots = []
         # The last slot may be wider than what is left of the runs: its last run fills it up, and
         # is cut off again below. The order of runs changes nothing: each has its number's keys.
-        for start in range(0, count, width):
-            runs = np.minimum(np.arange(start, start + width), count - 1)
+        for start in range(0, num_runs, slot_width):
+            runs = np.minimum(np.arange(start, start + slot_width), num_runs - 1)
             slot_settings = division.put({name: values[runs] for name, values in settings.items()})
-            slot_numbers = division.put(numbers[runs].astype(np.uint32))
+            slot_numbers = division.put(seed_numbers[runs].astype(np.uint32))
             first_slots.append(compiled.begin(seed, slot_numbers, slot_settings))
         rows, keys = zip(*jax.device_get(first_slots), strict=True)
-        self._rows = np.concatenate(rows)[:count]
+        self._rows = np.concatenate(rows)[:num_runs]
         #: The runs of a slot alone, and its states after the last block.
         self._placed: tuple[np.ndarray, jax.Array] | None = None
-        self._test_keys = np.concatenate(keys, axis=1)[:, :count]
+        self._test_keys = np.concatenate(keys, axis=1)[:, :num_runs]
 
     def states(self) -> RunState:
         """Returns the states of all runs, on the host in memory of their own."""
@@ -171,8 +175,8 @@ class Slots:
 
     def advance(
         self,
-        chosen: np.ndarray | None = None,
-        lengths: np.ndarray | None = None,
+        is_advanced: np.ndarray | None = None,
+        episode_lengths: np.ndarray | None = None,
         *,
         evaluate: bool = True,
         max_blocks: int = 1,
@@ -180,8 +184,8 @@ class Slots:
         """Evaluates runs and makes a block of updates, several times.
 
         Args:
-          chosen: [R] which of them, at least one; all by default.
-          lengths: [R] about how long their episodes are, see ``pack_slots``.
+          is_advanced: [R] which of them, at least one; all by default.
+          episode_lengths: [R] about how long their episodes are, see ``pack_slots``.
           evaluate: whether to evaluate before the first block.
           max_blocks: how many blocks, where a slot holds these runs. Else they are packed again
             after one.
@@ -189,12 +193,12 @@ class Slots:
         Returns:
           What was measured in each block in which a run made an update.
         """
-        slots = self._pack(chosen, lengths)
+        slots = self._pack(is_advanced, episode_lengths)
         programs = self._compiled
         num_blocks = max_blocks if len(slots) == 1 else 1
         budget = self._division.put(tuple(self.budget), NONE)
 
-        def move(runs: np.ndarray) -> Any:
+        def advance_slot(runs: np.ndarray) -> Any:
             """Moves one slot; returns its states on the device, on the host, and its blocks."""
             states = self._put(runs)
             occupied = self._division.put(runs >= 0)
@@ -216,15 +220,15 @@ class Slots:
                 evaluation_due = True  # the block has changed the policies
             return states, *jax.device_get((states, blocks))
 
-        placed, rows, blocks = zip(*_side_by_side(move, slots), strict=True)
+        device_states, rows, blocks = zip(*_side_by_side(advance_slot, slots), strict=True)
         for runs, slot_rows in zip(slots, rows, strict=True):
             self._rows[runs[runs >= 0]] = slot_rows[runs >= 0]
         # The states of a slot alone stay on the device: the next block has the same runs.
-        self._placed = (slots[0], placed[0]) if len(slots) == 1 else None
+        self._placed = (slots[0], device_states[0]) if len(slots) == 1 else None
         # A slot has its blocks one after the other; a block is joined over its slots. Blocks after
         # the end of all runs made no update.
-        joined = [_of_slots(slots, block) for block in zip(*blocks, strict=True)]
-        return [measured for measured in joined if measured.metrics["active"].any()]
+        joined_blocks = [_of_slots(slots, block) for block in zip(*blocks, strict=True)]
+        return [measured for measured in joined_blocks if measured.metrics["active"].any()]
 
     def seconds_to_evaluate(self) -> float:
         """Returns how long an evaluation takes (s) that shares no launch with the updates."""
@@ -263,8 +267,8 @@ class Slots:
         self._placed = None
         test_metrics = {}
         for name in evaluations[0]:
-            average = np.sum if name.endswith("steps") else np.mean
-            test_metrics[name] = average([evaluation[name] for evaluation in evaluations], axis=0)
+            reduction = np.sum if name.endswith("steps") else np.mean
+            test_metrics[name] = reduction([evaluation[name] for evaluation in evaluations], axis=0)
         return test_metrics
 
     def _put(self, runs: np.ndarray) -> jax.Array:
@@ -278,26 +282,26 @@ class Slots:
         return self._division.put(self._rows[runs])
 
     def _pack(
-        self, chosen: np.ndarray | None = None, lengths: np.ndarray | None = None
+        self, is_packed: np.ndarray | None = None, episode_lengths: np.ndarray | None = None
     ) -> np.ndarray:
         """Returns the runs of each slot."""
         num_runs = len(self._rows)
-        if chosen is None:
-            chosen = np.ones(num_runs, bool)
-        if lengths is None:
-            lengths = np.zeros(num_runs)
-        return pack_slots(chosen, lengths, self._compiled.width, self._division.seeds)
+        if is_packed is None:
+            is_packed = np.ones(num_runs, bool)
+        if episode_lengths is None:
+            episode_lengths = np.zeros(num_runs)
+        return pack_slots(is_packed, episode_lengths, self._compiled.width, self._division.seeds)
 
 
-def _side_by_side(move: Callable[[np.ndarray], Any], slots: np.ndarray) -> list[Any]:
+def _side_by_side(advance_slot: Callable[[np.ndarray], Any], slots: np.ndarray) -> list[Any]:
     """Returns the results for all slots [slots, width], as many at once as there are cores.
 
     A slot alone leaves some of the cores waiting for each other, and its results are fetched
     while the next one is moved.
     """
     if len(slots) == 1:
-        return [move(slots[0])]
-    return list(_threads().map(move, slots))
+        return [advance_slot(slots[0])]
+    return list(_threads().map(advance_slot, slots))
 
 
 @functools.cache
@@ -317,8 +321,8 @@ def _of_slots(slots: np.ndarray, measured: Sequence[tuple[Arrays, Arrays]]) -> M
     # Empty places, -1, are sorted to the front and cut off.
     order = np.argsort(runs, kind="stable")[np.sum(runs < 0) :]
     metrics, eval_metrics = (
-        {name: np.concatenate([x[name] for x in kind], axis=-1)[..., order] for name in kind[0]}
-        for kind in zip(*measured, strict=True)
+        {name: np.concatenate([x[name] for x in group], axis=-1)[..., order] for name in group[0]}
+        for group in zip(*measured, strict=True)
     )
     return Measured(runs[order], metrics, eval_metrics)
 
@@ -335,9 +339,9 @@ def compile_slots(programs: Programs, config: Config, width: int) -> Compiled:
       ValueError: a slot does not fit into memory.
     """
     division = programs.division
-    size = StateRows(programs.like).size
-    check_room(2.0 * width * size)  # the states before a block of updates, and after it
-    rows, occupied = division.put((np.zeros((width, size), np.uint8), np.zeros(width, bool)))
+    row_bytes = StateRows(programs.like).size
+    check_room(2.0 * width * row_bytes)  # the states before a block of updates, and after it
+    rows, occupied = division.put((np.zeros((width, row_bytes), np.uint8), np.zeros(width, bool)))
     no_budget, no_evaluation = division.put((tuple(Budget.of(0, 0)), np.bool_(False)), NONE)
     # XLA compiles without Python's lock: while one program compiles in a thread, the next one is
     # traced here.
@@ -363,10 +367,10 @@ def _compile_begin(programs: Programs, width: int) -> Callable[..., Any]:
     """Compiles ``Compiled.begin``."""
     division = programs.division
     seed = division.shapes(jax.ShapeDtypeStruct((), np.uint32), NONE)
-    numbers = division.shapes(jax.ShapeDtypeStruct((width,), np.uint32), RUNS)
+    seed_numbers = division.shapes(jax.ShapeDtypeStruct((width,), np.uint32), RUNS)
     settings = division.shapes(shape_of_all(programs.like, width).settings, RUNS)
     program = division.jit(programs.begin, (NONE, RUNS, RUNS), (RUNS, SECOND))
-    return executable(program.lower(seed, numbers, settings))
+    return executable(program.lower(seed, seed_numbers, settings))
 
 
 def check_fits(program: jax.stages.Compiled) -> None:
@@ -374,5 +378,5 @@ def check_fits(program: jax.stages.Compiled) -> None:
     memory = program.memory_analysis()
     if memory is None:  # not every backend knows
         return
-    arrays = memory.argument_size_in_bytes + memory.output_size_in_bytes
-    check_room(arrays + memory.temp_size_in_bytes - memory.alias_size_in_bytes)
+    array_bytes = memory.argument_size_in_bytes + memory.output_size_in_bytes
+    check_room(array_bytes + memory.temp_size_in_bytes - memory.alias_size_in_bytes)

@@ -48,29 +48,29 @@ class Budget(NamedTuple):
     @classmethod
     def of(cls, env_steps: int | None, updates: int | None) -> "Budget":
         """Returns a budget, of which what has no limit has the greatest count."""
-        limits = (MAX_COUNT if limit is None else limit for limit in (env_steps, updates))
-        return cls(*map(counts.from_int, limits))
+        budget_limits = (MAX_COUNT if limit is None else limit for limit in (env_steps, updates))
+        return cls(*map(counts.from_int, budget_limits))
 
 
-def shape_of_all(like: RunState, num_runs: int) -> RunState:
+def shape_of_all(shapes: RunState, num_runs: int) -> RunState:
     """Returns the shapes of the states of so many runs, from those of some."""
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_runs, *x.shape[1:]), x.dtype), like)
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_runs, *x.shape[1:]), x.dtype), shapes)
 
 
 class StateRows:
     """Writes the states of runs as rows [R, B] of bytes, and reads them; no bit changes."""
 
-    def __init__(self, like: PyTree):
+    def __init__(self, state_shapes: PyTree):
         """Takes the states of any number of runs, or their shapes."""
-        self._like = like
-        leaves, self._structure = jax.tree.flatten(jax.eval_shape(plain, like))
+        self._like = state_shapes
+        leaves, self._structure = jax.tree.flatten(jax.eval_shape(plain, state_shapes))
         self._shapes = [leaf.shape[1:] for leaf in leaves]
         self._types = [np.dtype(leaf.dtype) for leaf in leaves]
-        sizes = [
-            int(np.prod(shape)) * kind.itemsize
-            for shape, kind in zip(self._shapes, self._types, strict=True)
+        leaf_bytes = [
+            int(np.prod(shape)) * dtype.itemsize
+            for shape, dtype in zip(self._shapes, self._types, strict=True)
         ]
-        *self._ends, self.size = np.cumsum(sizes).tolist()
+        *self._ends, self.size = np.cumsum(leaf_bytes).tolist()
 
     @property
     def layout(self) -> str:
@@ -110,19 +110,19 @@ class StateRows:
                 return column.astype(dtype)
             # A bitcast to a wider type takes the bytes of a number from the last axis.
             width = column.shape[1] // dtype.itemsize
-            numbers = column.reshape(len(column), width, dtype.itemsize)
-            return lax.bitcast_convert_type(numbers, dtype)
+            leaf_bytes = column.reshape(len(column), width, dtype.itemsize)
+            return lax.bitcast_convert_type(leaf_bytes, dtype)
 
         columns = jnp.split(rows, self._ends, axis=1)
         return self._shaped(map(read, columns, self._types))
 
     def _shaped(self, leaves: Iterable[np.ndarray] | Iterable[jax.Array]) -> Any:
         """Returns states of leaves [R, numbers], which have the data of keys."""
-        shaped = [
+        shaped_leaves = [
             leaf.reshape(len(leaf), *shape)
             for leaf, shape in zip(leaves, self._shapes, strict=True)
         ]
-        return with_keys(jax.tree.unflatten(self._structure, shaped), self._like)
+        return with_keys(jax.tree.unflatten(self._structure, shaped_leaves), self._like)
 
 
 def _flat(leaf: PyTree) -> Any:
@@ -148,66 +148,66 @@ def first_best(train_states: TrainState) -> Best:
     actor, num_updates = jax.tree.map(np.array, (train_states.actor, train_states.num_updates))
     # Any return is better, also -inf: of equals the later counts. In JAX's type of floats, which
     # is that of evaluations.
-    worst = np.full(len(num_updates), -np.inf, jnp.result_type(float))
-    return Best(actor=actor, eval_return=worst, num_updates=num_updates)
+    worst_return = np.full(len(num_updates), -np.inf, jnp.result_type(float))
+    return Best(actor=actor, eval_return=worst_return, num_updates=num_updates)
 
 
-def keep_best(best: Best, present: Best) -> Best:
+def keep_best(best: Best, present_best: Best) -> Best:
     """Returns the better policy of each seed; of two that are equal, the later is the better.
 
     Args:
       best: so far.
-      present: those of an evaluation; a return that is not a number is never the best.
+      present_best: those of an evaluation; a return that is not a number is never the best.
     """
     # A NaN is no better than anything.
-    better = present.eval_return >= best.eval_return
+    is_better = present_best.eval_return >= best.eval_return
 
-    def choose(new: np.ndarray, old: np.ndarray) -> np.ndarray:
-        return np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+    def choose(new_leaf: np.ndarray, old_leaf: np.ndarray) -> np.ndarray:
+        return np.where(is_better.reshape(-1, *[1] * (new_leaf.ndim - 1)), new_leaf, old_leaf)
 
-    return jax.tree.map(choose, present, best)
+    return jax.tree.map(choose, present_best, best)
 
 
-def seed_keys(seed: Seed, numbers: jax.Array | np.ndarray) -> jax.Array:
+def seed_keys(seed: Seed, seed_numbers: jax.Array | np.ndarray) -> jax.Array:
     """Returns the keys [R] that the seeds numbered so begin with: those of ``jax.random.split``."""
-    return _for_each_seed(_root_key(seed, domain=0), numbers)
+    return _for_each_seed(_root_key(seed, key_domain=0), seed_numbers)
 
 
-def eval_keys(numbers: jax.Array | np.ndarray) -> jax.Array:
+def eval_keys(seed_numbers: jax.Array | np.ndarray) -> jax.Array:
     """Returns the keys of every evaluation but the last test, of the seeds [R] numbered so."""
-    return _for_each_seed(_root_key(_EVALUATION_ROOT, domain=1), numbers)
+    return _for_each_seed(_root_key(_EVALUATION_ROOT, key_domain=1), seed_numbers)
 
 
-def last_test_keys(numbers: jax.Array | np.ndarray, config: Config) -> jax.Array:
+def last_test_keys(seed_numbers: jax.Array | np.ndarray, config: Config) -> jax.Array:
     """Returns the keys [K, R] of the last test, which plays the episodes of K evaluations."""
     # The programs play ``eval_episodes`` at once, and no others are compiled for the test.
-    rounds = -(-(config.test_episodes or config.eval_episodes) // config.eval_episodes)
-    keys = jax.random.split(_root_key(_EVALUATION_ROOT, domain=2), rounds)
-    return jax.vmap(_for_each_seed, in_axes=(0, None))(keys, numbers)
+    num_rounds = -(-(config.test_episodes or config.eval_episodes) // config.eval_episodes)
+    keys = jax.random.split(_root_key(_EVALUATION_ROOT, key_domain=2), num_rounds)
+    return jax.vmap(_for_each_seed, in_axes=(0, None))(keys, seed_numbers)
 
 
 #: Policies of all runs are evaluated from the same starts, whatever their root is.
 _EVALUATION_ROOT = 0
 
 
-def _root_key(seed: Seed, domain: int) -> jax.Array:
+def _root_key(seed: Seed, key_domain: int) -> jax.Array:
     """Returns the root of the keys of training (domain 0), evaluation (1), or the last test (2).
 
     The domains share no key, whatever seeds the user chooses.
     """
-    return jax.random.fold_in(jax.random.key(seed), domain)
+    return jax.random.fold_in(jax.random.key(seed), key_domain)
 
 
-def _for_each_seed(key: jax.Array, numbers: jax.Array | np.ndarray) -> jax.Array:
+def _for_each_seed(key: jax.Array, seed_numbers: jax.Array | np.ndarray) -> jax.Array:
     """Returns keys [R], each by the seed's number alone, however many seeds there are.
 
     Start states shared by all seeds would be a chance that no interval over seeds knows of.
     """
-    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.asarray(numbers))
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.asarray(seed_numbers))
 
 
 #: Settings of a policy that only say how its first parameters were drawn.
-_DRAWN = ("initial_std", "initializer", "env")
+_INIT_SETTINGS = ("initial_std", "initializer", "env")
 
 
 def last_actors(config: Config, policy: Mapping[str, Any]) -> Actor:
@@ -226,24 +226,24 @@ def last_actors(config: Config, policy: Mapping[str, Any]) -> Actor:
     assert config.init_from is not None
     directory = Path(config.init_from)
     run = read_run(directory)
-    source = read_policy(policy_folder(run, "last"), trusted_code=config.policy)
+    saved_policy = read_policy(policy_folder(run, "last"), trusted_code=config.policy)
     # Parameters fit only the network, the family and the spaces for which they were trained.
     for name, value in policy.items():
-        old = source.settings.get(name, value)
-        if name not in _DRAWN and old != value:
+        saved_value = saved_policy.settings.get(name, value)
+        if name not in _INIT_SETTINGS and saved_value != value:
             raise ValueError(
-                f"the policies in {directory}, trained on {run.env}, have {name} {old}, and this "
-                f"run {value}; make them agree, or leave --init-from out"
+                f"the policies in {directory}, trained on {run.env}, have {name} {saved_value}, "
+                f"and this run {value}; make them agree, or leave --init-from out"
             )
     # A run with more seeds than that one begins with some of its policies several times.
-    seeds = (config.first_seed + np.arange(config.num_seeds)) % source.num_seeds
-    return jax.tree.map(lambda x: x[seeds], source.actor)
+    seeds = (config.first_seed + np.arange(config.num_seeds)) % saved_policy.num_seeds
+    return jax.tree.map(lambda x: x[seeds], saved_policy.actor)
 
 
 def begin_with(state: RunState, actors: Actor) -> RunState:
     """Returns the state of a run before its first update, with actors [S, ...] of another."""
-    old = state.train_states.actor
-    actor = jax.tree.map(lambda new, like: np.asarray(new, like.dtype), actors, old)
+    init_actor = state.train_states.actor
+    actor = jax.tree.map(lambda leaf, first: np.asarray(leaf, first.dtype), actors, init_actor)
     return dataclasses.replace(
         state, train_states=dataclasses.replace(state.train_states, actor=actor)
     )

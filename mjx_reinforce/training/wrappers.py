@@ -24,14 +24,14 @@ from mjx_reinforce.learning.policy import Actor
 
 #: Episodes are short if none is longer than the horizon divided by this, or than the cut. An update
 #: passes over all steps that there may be: it takes its time from the horizon, not the episodes.
-_SHORT = 8
+_SHORT_DIVISOR = 8
 #: Updates of so many steps, of all seeds, are compiled for short episodes too. Measured on two CPU
 #: cores: that saves 70 ns for each of these steps in such an update, and takes 4 s to compile.
-_MANY = 2**19
+_MIN_STEPS = 2**19
 
 #: How the episodes of an update are divided among devices.
-_specs: Any = Trajectory
-_EPISODES = _specs(
+_TrajectorySpecs: Any = Trajectory
+_EPISODES = _TrajectorySpecs(
     observation=SECOND,
     action=SECOND,
     reward=SECOND,
@@ -142,8 +142,8 @@ class SharedLaunch:
                 in_specs = NONE, NONE, NONE, RUNS, RUNS
                 out_specs = SharedEpisodes(_EPISODES, evaluation_specs)
                 play_share = self.devices.map(play_share, in_specs, out_specs)
-            chosen = jnp.broadcast_to(active, num_episodes)
-            return play_share(actor, evaluation_arrays, limit, keys, chosen)
+            active_episodes = jnp.broadcast_to(active, num_episodes)
+            return play_share(actor, evaluation_arrays, limit, keys, active_episodes)
 
         episodes: SharedEpisodes = self.learner.play(state, key, active, rollout)
         if self.devices is None or evaluation is None:
@@ -161,7 +161,7 @@ class SharedLaunch:
         evaluation: Any,
         limit: Any,
         keys: Any,
-        chosen: Any,
+        active: Any,
     ) -> SharedEpisodes:
         """Plays episodes of these keys, as far as they are chosen, after those of an evaluation.
 
@@ -170,33 +170,33 @@ class SharedLaunch:
         without one. Of several devices each plays a share of the episodes, and the first one the
         evaluation's.
         """
-        count = 0
+        num_evaluated = 0
         modes = False
         if evaluation is not None:
             eval_keys, eval_modes, eval_active = evaluation
             # All devices run one program, so all have room for the evaluation; one plays it.
             if self.devices is not None:
                 eval_active = eval_active & (self.devices.number() == 0)
-            count = len(eval_keys)
+            num_evaluated = len(eval_keys)
             # Its episodes come first, so that a slice takes either kind below.
             modes = jnp.concatenate([eval_modes, jnp.zeros(len(keys), bool)])
-            chosen = jnp.concatenate([jnp.broadcast_to(eval_active, count), chosen])
+            active = jnp.concatenate([jnp.broadcast_to(eval_active, num_evaluated), active])
             if limit is not None:
                 training_limit = jnp.broadcast_to(limit, len(keys))
-                limit = jnp.concatenate([jnp.full(count, horizon), training_limit])
+                limit = jnp.concatenate([jnp.full(num_evaluated, horizon), training_limit])
             keys = jnp.concatenate([eval_keys, keys])
         episodes = play(
-            actor, keys, horizon=horizon, deterministic=modes, active=chosen, limit=limit
+            actor, keys, horizon=horizon, deterministic=modes, active=active, limit=limit
         )
         if self.devices is not None:
             # Each has counted its own; the metrics of an update have the steps of all.
-            simulated = self.devices.sum(episodes.simulated)
-            episodes = dataclasses.replace(episodes, simulated=simulated)
+            simulated_steps = self.devices.sum(episodes.simulated)
+            episodes = dataclasses.replace(episodes, simulated=simulated_steps)
         if evaluation is None:
             return SharedEpisodes(episodes, None)
         return SharedEpisodes(
-            training=episodes.episodes(slice(count, None)),
-            evaluation=episodes.episodes(slice(count)),
+            training=episodes.episodes(slice(num_evaluated, None)),
+            evaluation=episodes.episodes(slice(num_evaluated)),
         )
 
 
@@ -216,8 +216,8 @@ def step_with(
     def learn(
         state: TrainState, episodes: SharedEpisodes, key: jax.Array
     ) -> tuple[TrainState, dict[str, Any]]:
-        after, metrics = learner.learn(state, episodes.training, key)
-        return after, metrics | {_EVALUATION: episodes.evaluation}
+        next_state, metrics = learner.learn(state, episodes.training, key)
+        return next_state, metrics | {_EVALUATION: episodes.evaluation}
 
     play = functools.partial(launch.with_evaluation, evaluation=evaluation)
     after, metrics = learner._replace(play=play, learn=learn).step(state, active)
@@ -234,20 +234,20 @@ def short_episodes(learner: Learner, horizon: int, num_seeds: int, cut_steps: in
       num_seeds: how many learn at once, vmapped. It decides nothing but speed and rounding.
       cut_steps: after which episodes of training are cut, 0 if they are not.
     """
-    few = max(horizon // _SHORT, cut_steps)
+    max_length = max(horizon // _SHORT_DIVISOR, cut_steps)
 
     def learn(
         state: TrainState, trajectory: Trajectory, key: jax.Array
     ) -> tuple[TrainState, Metrics]:
-        """``Learner.learn``, which passes over ``few`` steps where no episode is longer."""
+        """``Learner.learn``, which passes over ``max_length`` steps where no episode is longer."""
         # A second program for short episodes does not pay where updates are small or hardly longer.
-        if not CHUNK_STEPS <= few < horizon or num_seeds * trajectory.mask.size < _MANY:
+        if not CHUNK_STEPS <= max_length < horizon or num_seeds * trajectory.mask.size < _MIN_STEPS:
             return learner.learn(state, trajectory, key)
         # One choice for all seeds: of a choice for each, vmap would compute both.
         return jax.lax.cond(
-            any_lane(jnp.any(trajectory.mask[few])),
+            any_lane(jnp.any(trajectory.mask[max_length])),
             lambda: learner.learn(state, trajectory, key),
-            lambda: learner.learn(state, trajectory.first(few), key),
+            lambda: learner.learn(state, trajectory.first(max_length), key),
         )
 
     return learner._replace(learn=learn)
@@ -281,20 +281,20 @@ def check_learner(name: str, learner: Learner) -> None:
     check_kind(f"what {name} returns", learner, Learner, "mjx_reinforce.reinforce(env)")
     # Shapes alone: nothing is played.
     state = traced(f"the learner of {name}", learner.init, jax.random.key(0))
-    after, metrics = traced(f"the learner of {name}", learner.step, state)
-    if _shapes(after) != _shapes(state):
+    next_state, metrics = traced(f"the learner of {name}", learner.step, state)
+    if _shapes(next_state) != _shapes(state):
         raise ValueError(
             f"learn of the learner of {name} must return a state of the structure, shapes and "
             "dtypes of the one that it gets"
         )
-    if missing := [name for name in _METRICS if name not in metrics]:
+    if missing_metrics := [name for name in _METRICS if name not in metrics]:
         raise ValueError(
-            f"learn of the learner of {name} must also return the metrics {', '.join(missing)}: "
-            "see mjx_reinforce.train_step"
+            f"learn of the learner of {name} must also return the metrics "
+            f"{', '.join(missing_metrics)}: see mjx_reinforce.train_step"
         )
 
 
-def _shapes(tree: PyTree) -> Any:
+def _shapes(array_tree: PyTree) -> Any:
     """Returns the structure of a tree, and the shape and dtype of each leaf."""
-    leaves, structure = jax.tree.flatten(tree)
-    return structure, [(x.shape, x.dtype) for x in leaves]
+    leaves, treedef = jax.tree.flatten(array_tree)
+    return treedef, [(x.shape, x.dtype) for x in leaves]

@@ -105,7 +105,7 @@ def test_one_trace_and_nothing_donated_and_seeds_together_are_the_seeds_alone():
     assert metrics["episode_return"].shape == (3,)
     diagnostics = {"kl", "policy_std", "explained_variance", "gradient_snr"}
     assert all(np.all(np.isfinite(metrics[name])) for name in diagnostics)
-    before = learner_module._step._cache_size()
+    before = learner_module._jitted_step._cache_size()
     for s, key in enumerate(jax.random.split(jax.random.key(0), 3)):
         state = init(key)
         alone, metrics = train_step(learner, state)
@@ -117,7 +117,7 @@ def test_one_trace_and_nothing_donated_and_seeds_together_are_the_seeds_alone():
     again = train_step(learner, state)
     jax.tree.map(np.testing.assert_array_equal, (alone.actor, metrics), (again[0].actor, again[1]))
     train_step(learner, alone)
-    assert learner_module._step._cache_size() == before + 1
+    assert learner_module._jitted_step._cache_size() == before + 1
 
 
 @pytest.mark.slow
@@ -221,7 +221,7 @@ def test_short_episodes_are_learned_from_in_short(monkeypatch):
 
     learned, branches = [], []
     for many in (2 * 3 * 400, 2 * 3 * 400 + 1):
-        monkeypatch.setattr(wrappers, "_MANY", many)
+        monkeypatch.setattr(wrappers, "_MIN_STEPS", many)
         settings = {"optimizer": optax.sgd(1.0), "engine": "vmap"}
         learner = reinforce(Ends(), num_episodes=3, **settings)
         learner = wrappers.short_episodes(learner, Ends.max_episode_steps, num_seeds=2)
@@ -237,7 +237,7 @@ def test_short_episodes_are_learned_from_in_short(monkeypatch):
 @pytest.mark.slow
 def test_episodes_are_cut_until_a_share_of_the_budget_is_used(monkeypatch):
     """An update learns what one does whose episodes all have that horizon."""
-    monkeypatch.setattr(wrappers, "_MANY", 0)
+    monkeypatch.setattr(wrappers, "_MIN_STEPS", 0)
     settings = {"num_episodes": 8, "engine": "vmap"}
     settings["policy"] = mlp_policy(2, normal(Drifting.action_space), ())
     cut = wrappers.short_episodes(reinforce(Drifting(), horizon=100, **settings), 100, 1, 50)

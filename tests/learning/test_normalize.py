@@ -16,7 +16,7 @@ def merged(*batches, at_most=1e9):
     for observation in batches:
         poisoned = np.where(MASK[..., None], observation, np.nan)
         normalizer = normalize.update(
-            normalizer, jnp.asarray(poisoned), jnp.asarray(MASK), at_most=at_most
+            normalizer, jnp.asarray(poisoned), jnp.asarray(MASK), max_count=at_most
         )
     return normalizer
 
@@ -51,7 +51,7 @@ def test_a_batch_is_merged_while_fewer_are_counted(at_most, batches):
 def test_an_empty_batch_changes_nothing():
     before = merged(FIRST)
     after = normalize.update(
-        before, jnp.full((5, 3, 2), jnp.nan), jnp.zeros((5, 3), bool), at_most=1e9
+        before, jnp.full((5, 3, 2), jnp.nan), jnp.zeros((5, 3), bool), max_count=1e9
     )
     for name in ("count", "mean", "m2"):
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
@@ -61,7 +61,7 @@ def test_nothing_counted_is_the_identity():
     observation = jnp.array([[50.0, -3.0]])
     np.testing.assert_array_equal(normalize.apply(normalize.init(2), observation), observation)
     nothing = normalize.update(
-        normalize.init(2), jnp.ones((1, 1, 2)), jnp.zeros((1, 1), bool), at_most=1e9
+        normalize.init(2), jnp.ones((1, 1, 2)), jnp.zeros((1, 1), bool), max_count=1e9
     )
     np.testing.assert_array_equal(normalize.apply(nothing, observation), observation)
 
@@ -78,7 +78,7 @@ def test_scaled_by_the_standard_deviation_and_clipped_at_ten():
 def test_one_observation_is_normalised_by_the_least_deviation():
     """The deviation of one is 0 and counts as 1e-4: a constant entry stays small."""
     normalizer = normalize.update(
-        normalize.init(1), jnp.full((1, 1, 1), 0.25), jnp.ones((1, 1), bool), at_most=1
+        normalize.init(1), jnp.full((1, 1, 1), 0.25), jnp.ones((1, 1), bool), max_count=1
     )
     assert float(normalizer.count) == 1
     scaled = normalize.apply(normalizer, jnp.array([[0.25], [0.25 + 2.0**-12]]))

@@ -55,6 +55,6 @@ def test_measurements_add_up():
 
 def test_progress_is_what_the_runs_have_made_and_last_returned():
     record = filled()
-    now = record.progress_at(0.5, seconds=2.5, gained=0.25, passed=3.0)
+    now = record.progress_at(0.5, seconds=2.5, gained_fraction=0.25, seconds_passed=3.0)
     assert record.used().tolist() == pytest.approx([0, 0.6, 0, 1.3])
     assert now == (0.5, 4, 190 / 4, now.iqm, 1, 0, 4, 190 / 2.5, 6)

@@ -48,7 +48,7 @@ def lose(monkeypatch, owner, name, when, how):
         return method(*arguments, **options)
 
     monkeypatch.setattr(owner, name, losing)
-    monkeypatch.setattr(driver, "_SECONDS", 0.0)  # the host looks at every block
+    monkeypatch.setattr(driver, "_CALL_SECONDS", 0.0)  # the host looks at every block
 
 
 def check_lost(status, loss, capsys):

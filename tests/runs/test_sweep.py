@@ -250,11 +250,11 @@ def test_blocks_without_a_pause_change_nothing(run, monkeypatch):
         return blocks
 
     monkeypatch.setattr(slots.Slots, "advance", counted)
-    monkeypatch.setattr(driver, "_SECONDS", 60.0)
+    monkeypatch.setattr(driver, "_CALL_SECONDS", 60.0)
     assert run(f"{command} --output several") == 0
     assert made[:4] == [1, 2, 4, 8]
     several, total = curves(Path("several")), sum(made)
-    monkeypatch.setattr(driver, "_SECONDS", 0.0)
+    monkeypatch.setattr(driver, "_CALL_SECONDS", 0.0)
     made.clear()
     assert run(f"{command} --output each") == 0
     assert set(made) == {1}
@@ -329,7 +329,7 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
 @pytest.mark.slow
 def test_a_chunk_that_goes_on_saves_when_it_is_due(run, monkeypatch):
     """Not at its first look: the checkpoint that it was found in counts."""
-    monkeypatch.setattr(driver, "_SECONDS", 0.0)
+    monkeypatch.setattr(driver, "_CALL_SECONDS", 0.0)
     command = f"{SMALL} --num-seeds 2 --eval-every 1 --checkpoint-every 2 {RATES}"
     save, saved = SweepFiles._save_checkpoint, []
 

@@ -143,7 +143,7 @@ def test_a_program_that_launches_a_gpus_kernel_is_kept(monkeypatch):
 
 def test_a_program_whose_kernel_is_gone_is_not_read():
     name = gpu._target("0" * 64).encode()
-    for each in ("facts", *ready._PROGRAMS):
+    for each in ("facts", *ready._PROGRAM_NAMES):
         cache.Cache.find().write(f"key-{each}", name if each == "advance" else b"{}")
     assert ready.load_ready("key") is None
 

@@ -84,8 +84,8 @@ _ONCE = {"values": [{}]}
 
 def rows(table: Table, labels: Sequence[str]) -> list[dict[str, Any]]:
     """Returns a table row by row, with the labels of its configurations."""
-    names = list(table)
-    records = [dict(zip(names, row, strict=True)) for row in zip(*table.values(), strict=True)]
+    columns = list(table)
+    records = [dict(zip(columns, row, strict=True)) for row in zip(*table.values(), strict=True)]
     # Tables hold places, so that a page has each label, which may be long, only once.
     if "configuration" in table:
         return [row | {"configuration": labels[row["configuration"]]} for row in records]
@@ -121,10 +121,10 @@ def means(results: Sequence[Result]) -> Table:
     }
 
 
-def stacked(parts: Iterable[Mapping[str, Any]]) -> Table:
+def stacked(tables: Iterable[Mapping[str, Any]]) -> Table:
     """Returns tables below each other; what is no list in one is the same in all of its rows."""
     table: Table = {}
-    for part in parts:
+    for part in tables:
         # Every part has one list at least, which says how many rows its constants fill.
         length = next(len(x) for x in part.values() if isinstance(x, list))
         for name, values in part.items():
@@ -245,16 +245,16 @@ def _by_place(labels: Sequence[str], looks: Sequence[Any], *, legend: bool = Tru
     It has as many columns as the page has room for. Not as the chart has: that is narrowed to leave
     room for the axis once the legend is laid out.
     """
-    layout = None
+    legend_spec = None
     if legend and len(labels) > 1:
         # A letter is about 7 pixels wide; 50 more hold the stroke and the gap to the next column.
-        column = min(7 * max(map(len, labels)), CONFIG["legend"]["labelLimit"]) + 50
-        columns = f"max(1, floor((width && containerSize()[0] || width) / {column}))"
-        layout = {"title": None, "orient": "top", "direction": "horizontal", "offset": 36}
-        layout |= {"columns": {"expr": columns}, "values": {"expr": "shown"}}
-        layout |= {"symbolType": "stroke", "symbolOpacity": 1, "labelFontSize": 12}
+        column_width = min(7 * max(map(len, labels)), CONFIG["legend"]["labelLimit"]) + 50
+        num_columns = f"max(1, floor((width && containerSize()[0] || width) / {column_width}))"
+        legend_spec = {"title": None, "orient": "top", "direction": "horizontal", "offset": 36}
+        legend_spec |= {"columns": {"expr": num_columns}, "values": {"expr": "shown"}}
+        legend_spec |= {"symbolType": "stroke", "symbolOpacity": 1, "labelFontSize": 12}
     scale = {"domain": list(labels), "range": list(looks)}
-    return {**_CONFIGURATION, "scale": scale, "legend": layout}
+    return {**_CONFIGURATION, "scale": scale, "legend": legend_spec}
 
 
 def moment_line(findings: Findings) -> Spec:
@@ -271,22 +271,22 @@ def moment_line(findings: Findings) -> Spec:
     }
 
 
-def threshold_line(findings: Findings, axis: str, drawn: np.ndarray) -> list[Spec]:
+def threshold_line(findings: Findings, axis: str, drawn_returns: np.ndarray) -> list[Spec]:
     """Returns the line at the return that counts as solved, and its name.
 
     There is none beyond the returns that are drawn: axes end where the data do.
     """
     threshold = findings.experiment.threshold
-    finite = drawn[np.isfinite(drawn)]
-    if threshold is None or not finite.size or not finite.min() <= threshold <= finite.max():
+    heights = drawn_returns[np.isfinite(drawn_returns)]
+    if threshold is None or not heights.size or not heights.min() <= threshold <= heights.max():
         return []
     # Below the line, at its end: curves come from below and end above.
     position = {"x": {"value": {"expr": "width - 4"}}}
-    look = {"baseline": "top", "dy": 5}
+    label_style = {"baseline": "top", "dy": 5}
     if axis == "x":
         position = {"y": {"value": {"expr": "height - 5"}}}
-        look = {"baseline": "bottom", "dx": -5}
+        label_style = {"baseline": "bottom", "dx": -5}
     rule = {"mark": {"type": "rule", "strokeDash": [6, 4], "opacity": 0.8}}
     label_encoding = {**position, "text": {"value": "solved"}}
-    label = layer("text", label_encoding, align="right", color="var(--soft)", **look)
+    label = layer("text", label_encoding, align="right", color="var(--soft)", **label_style)
     return [{"data": _ONCE, "encoding": {axis: {"datum": threshold}}, "layer": [rule, label]}]

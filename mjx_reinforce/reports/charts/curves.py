@@ -22,11 +22,11 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
     """Yields the chart."""
     threshold = findings.experiment.threshold
     returns = [result.configuration.eval_return.ravel() for result in findings.results]
-    solved = charts.threshold_line(findings, "y", np.concatenate(returns))
+    threshold_layers = charts.threshold_line(findings, "y", np.concatenate(returns))
     # Who looks for the line has to be told why there is none.
-    beyond = ""
-    if threshold is not None and not solved:
-        beyond = f" The return that counts as solved, {number(threshold)}, lies beyond the figure."
+    note = ""
+    if threshold is not None and not threshold_layers:
+        note = f" The return that counts as solved, {number(threshold)}, lies beyond the figure."
     layers = [
         # Single seeds lie below the band, which would be hidden by hundreds of them.
         {
@@ -34,7 +34,7 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
             "layer": [_lines_of_seeds(), _band_and_line(findings)],
         },
         charts.moment_line(findings),
-        *solved,
+        *threshold_layers,
     ]
     bands = _bands(findings)
     interval = ", and its 95% bootstrap interval" if charts.has_width(bands) else ""
@@ -50,7 +50,7 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         title="Learning curves",
         caption=(
             f"The interquartile mean over seeds of the return without exploration{interval}. "
-            f"{lines} Point at a curve to read it.{beyond}"
+            f"{lines} Point at a curve to read it.{note}"
         ),
         alt="Return over env steps, a line for each configuration that is shown.",
         data={"curves": bands, "seeds": _seeds(findings)},
@@ -87,8 +87,8 @@ def picture(env: str, threshold: float | None, history: dict[str, np.ndarray]) -
     if enough(num_seeds):
         title += " and its 95% interval"
     # A threshold far away would press the curves into a corner.
-    finite = returns[np.isfinite(returns)]
-    if threshold is not None and finite.size and finite.min() <= threshold <= finite.max():
+    heights = returns[np.isfinite(returns)]
+    if threshold is not None and heights.size and heights.min() <= threshold <= heights.max():
         axes.axhline(threshold, color="0.3", linestyle="--", linewidth=1, label="solved")
         axes.legend(frameon=False)
     axes.set(title=f"{env}: {title}", xlabel="env steps per seed", ylabel=_RETURN)
@@ -114,19 +114,19 @@ def _lines_of_seeds() -> charts.Spec:
 def _band_and_line(findings: Findings) -> charts.Spec:
     """Returns the interval, the mean, and its point nearest to the pointer, which says itself."""
     band = {"y": _return("low"), "y2": {"field": "high"}}
-    mean = {"y": _return("value"), "strokeDash": charts.dashes(findings.labels)}
-    near = {"type": "point", "on": "pointerover", "fields": ["env_steps"], "nearest": True}
+    mean_channels = {"y": _return("value"), "strokeDash": charts.dashes(findings.labels)}
+    pointer = {"type": "point", "on": "pointerover", "fields": ["env_steps"], "nearest": True}
     # All points are there for the pointer to find, but only the nearest is seen.
     opacity = {"condition": {"param": "near", "empty": False, "value": 1}, "value": 0}
     # Vega-Lite leaves words out of a nearest point's tooltip, unless all data are in it.
-    look = {"size": 70, "filled": True, "tooltip": {"content": "data"}}
+    point_style = {"size": 70, "filled": True, "tooltip": {"content": "data"}}
     return charts.shown_rows("curves") | {
         "layer": [
             charts.layer("area", band, opacity=0.18, clip=True),
-            charts.layer("line", mean, strokeWidth=2.2, clip=True),
+            charts.layer("line", mean_channels, strokeWidth=2.2, clip=True),
             {
-                **charts.layer("point", {"y": _return("value"), "opacity": opacity}, **look),
-                "params": [{"name": "near", "select": near}],
+                **charts.layer("point", {"y": _return("value"), "opacity": opacity}, **point_style),
+                "params": [{"name": "near", "select": pointer}],
             },
         ]
     }
@@ -137,11 +137,11 @@ def _bands(findings: Findings) -> Table:
 
     def band_rows(place: int, result: Result) -> dict[str, Any]:
         """Returns one configuration's, without the points at which it has no mean."""
-        finite = np.isfinite(result.band.value)
+        is_finite = np.isfinite(result.band.value)
         return {
             "configuration": place,
-            "env_steps": short(findings.grid[finite], 7),
-            **{name: short(getattr(result.band, name)[finite]) for name in result.band._fields},
+            "env_steps": short(findings.grid[is_finite], 7),
+            **{name: short(getattr(result.band, name)[is_finite]) for name in result.band._fields},
         }
 
     return stacked(band_rows(place, result) for place, result in enumerate(findings.results))
@@ -150,21 +150,21 @@ def _bands(findings: Findings) -> Table:
 def _seeds(findings: Findings) -> Table:
     """Returns some curves of each configuration: from the worst seed to the best, evenly."""
     # So many of each that a page of a large sweep stays small, but five at least.
-    most = max(5, min(_DRAWN_OF_ONE, _DRAWN_OF_ALL // len(findings.results)))
+    max_lines = max(5, min(_DRAWN_OF_ONE, _DRAWN_OF_ALL // len(findings.results)))
 
     def seed_rows() -> Iterator[dict[str, Any]]:
         """Yields a table of each seed that is drawn."""
         for place, result in enumerate(findings.results):
-            ranked = from_the_worst(result)
-            ranks = np.linspace(0, len(ranked) - 1, min(most, len(ranked))).round()
-            for s in ranked[np.unique(ranks).astype(int)]:
+            ranked_seeds = from_the_worst(result)
+            ranks = np.linspace(0, len(ranked_seeds) - 1, min(max_lines, len(ranked_seeds))).round()
+            for s in ranked_seeds[np.unique(ranks).astype(int)]:
                 # A curve has gaps where its seed broke, and ends at its own budget.
-                finite = np.isfinite(result.seeds[:, s])
+                is_finite = np.isfinite(result.seeds[:, s])
                 yield {
                     "configuration": place,
                     "seed": int(result.configuration.seed[s]),
-                    "env_steps": short(findings.grid[finite], 7),
-                    "value": short(result.seeds[finite, s], 4),
+                    "env_steps": short(findings.grid[is_finite], 7),
+                    "value": short(result.seeds[is_finite, s], 4),
                 }
 
     return stacked(seed_rows())

@@ -18,17 +18,17 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
     """Yields the chart."""
     borders = _borders(findings)
     # What a lone configuration cannot do is not said: end earlier, or be compared with a row.
-    earlier = ""
-    heights = ""
+    end_note = ""
+    height_note = ""
     if len(findings.results) > 1:
-        earlier = ", and where a configuration ended earlier,"
-        heights = " The tallest bar of each row has the same height."
+        end_note = ", and where a configuration ended earlier,"
+        height_note = " The tallest bar of each row has the same height."
     # With one stop the page has no slider.
-    moment = ":"
+    moment_note = ":"
     if len(charts.slider_stops(findings)) > 1:
-        moment = (
+        moment_note = (
             " at the slider's time. Before its end, a dotted line marks that time in the curves. "
-            f"At its end{earlier} they show"
+            f"At its end{end_note} they show"
         )
     yield charts.make_chart(
         findings,
@@ -37,8 +37,8 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         name="distribution",
         title="Where the seeds are",
         caption=(
-            f"Histograms of all seeds' returns{moment} each seed's last evaluation, as in table 1."
-            f"{heights} The outermost bars include what lies beyond them."
+            f"Histograms of all seeds' returns{moment_note} each seed's last evaluation, as in "
+            f"table 1.{height_note} The outermost bars include what lies beyond them."
         ),
         alt="A histogram of returns for each configuration shown, with its median and worst.",
         data=_histograms(findings, borders),
@@ -51,25 +51,25 @@ _Y = {"axis": None, "scale": {"domain": [0, {"expr": "length(shown)"}], "nice": 
 
 def _at_the_moment(data: str, top: str) -> charts.Spec:
     """Returns the rows of a moment, with the ground of each one's row and how high it reaches."""
-    base = "length(shown) - 1 - indexof(shown, datum.configuration)"
+    row_number = "length(shown) - 1 - indexof(shown, datum.configuration)"
     return charts.shown_rows(
         data,
         {"filter": "datum.moment == moment"},
-        {"calculate": base, "as": "base"},
+        {"calculate": row_number, "as": "base"},
         {"calculate": f"datum.base + {top}", "as": "top"},
     )
 
 
 def _labels() -> charts.Spec:
     """Returns the ground of each row and, at its top, what is said of it."""
-    ground = {"x": {"value": 0}, "x2": {"value": "width"}, "y": charts.quantity("base", **_Y)}
+    baseline = {"x": {"value": 0}, "x2": {"value": "width"}, "y": charts.quantity("base", **_Y)}
     text = {"x": {"value": 2}, "y": charts.quantity("top", **_Y), "text": {"field": "said"}}
-    look = {"align": "left", "baseline": "top", "lineBreak": "\n", "lineHeight": 15}
+    label_style = {"align": "left", "baseline": "top", "lineBreak": "\n", "lineHeight": 15}
     # The text hangs from a little below the row's upper border, at 1.
     return _at_the_moment("moments", "0.92") | {
         "layer": [
-            charts.layer("rule", ground, opacity=0.6),
-            charts.layer("text", text, limit={"expr": "width"}, **look),
+            charts.layer("rule", baseline, opacity=0.6),
+            charts.layer("text", text, limit={"expr": "width"}, **label_style),
         ]
     }
 
@@ -98,12 +98,12 @@ def _bars(findings: Findings, borders: np.ndarray) -> charts.Spec:
 
 def _borders(findings: Findings) -> np.ndarray:
     """Returns the edges of the histograms' bars; what is beyond counts in the outer ones."""
-    values = np.concatenate([result.seeds.ravel() for result in findings.results])
-    values = values[np.isfinite(values)]
-    if not values.size:
+    returns = np.concatenate([result.seeds.ravel() for result in findings.results])
+    returns = returns[np.isfinite(returns)]
+    if not returns.size:
         return np.linspace(0.0, 1.0, _BARS + 1)
     # One seed in a thousand may lie far out, and would squeeze all others into one bar.
-    low, high = np.quantile(values, [0.001, 0.999])
+    low, high = np.quantile(returns, [0.001, 0.999])
     if low == high:
         return np.linspace(low - 0.5, high + 0.5, _BARS + 1)
     return np.linspace(low, high, _BARS + 1)
@@ -121,41 +121,41 @@ def _histograms(findings: Findings, borders: np.ndarray) -> dict[str, Table]:
     for place, result in enumerate(findings.results):
         end = result.configuration.env_steps[-1].min()
         for moment, k in enumerate(stops):
-            ended = bool(findings.grid[k] > end)
-            values = result.final if ended or k == stops[-1] else result.seeds[k]
+            has_ended = bool(findings.grid[k] > end)
+            returns = result.final if has_ended or k == stops[-1] else result.seeds[k]
             # Clipped, so that what lies beyond the borders is in the outermost bars.
-            finite = np.clip(values[np.isfinite(values)], borders[0], borders[-1])
-            counts, _ = np.histogram(finite, borders)
+            finite_returns = np.clip(returns[np.isfinite(returns)], borders[0], borders[-1])
+            counts, _ = np.histogram(finite_returns, borders)
             # Bars without seeds are not written: they are most of all rows.
-            filled = np.flatnonzero(counts)
+            filled_bins = np.flatnonzero(counts)
             row = {"configuration": place, "moment": moment}
             bars.append(
                 {
                     **row,
-                    "low": short(borders[filled]),
-                    "high": short(borders[filled + 1]),
-                    "share": short(counts[filled] / len(values), 3),
+                    "low": short(borders[filled_bins]),
+                    "high": short(borders[filled_bins + 1]),
+                    "share": short(counts[filled_bins] / len(returns), 3),
                     # Over the tallest of its own row, so that every row uses its height.
-                    "height": short(counts[filled] / max(counts.max(), 1), 3),
+                    "height": short(counts[filled_bins] / max(counts.max(), 1), 3),
                 }
             )
-            texts.append({**row, "said": [_row_text(findings, result, values, ended)]})
+            texts.append({**row, "said": [_row_text(findings, result, returns, has_ended)]})
     return {"histogram": stacked(bars), "moments": stacked(texts)}
 
 
-def _row_text(findings: Findings, result: Result, values: np.ndarray, ended: bool) -> str:
+def _row_text(findings: Findings, result: Result, returns: np.ndarray, has_ended: bool) -> str:
     """Returns a configuration's label and what its seeds return, which may be its last returns."""
-    finite = values[np.isfinite(values)]
+    finite_returns = returns[np.isfinite(returns)]
     text = f"{result.configuration.label}\n"
-    if not len(finite):
+    if not len(finite_returns):
         return f"{text}no seed is finite"
-    if ended:
+    if has_ended:
         text += "its end: "
-    text += f"median {np.median(finite):,.4g}, worst {finite.min():,.4g}"
+    text += f"median {np.median(finite_returns):,.4g}, worst {finite_returns.min():,.4g}"
     if findings.experiment.threshold is not None:
         # Of all seeds, as in table 1: one that failed has not solved the task.
-        solved = int(np.sum(finite >= findings.experiment.threshold))
-        text += f", {solved:,} of {len(values):,} solved"
-    if len(finite) < len(values):
-        text += f", {len(values) - len(finite):,} not finite"
+        num_solved = int(np.sum(finite_returns >= findings.experiment.threshold))
+        text += f", {num_solved:,} of {len(returns):,} solved"
+    if len(finite_returns) < len(returns):
+        text += f", {len(returns) - len(finite_returns):,} not finite"
     return text

@@ -17,7 +17,7 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
     best = results[0]
     if len(results) == 1:
         return
-    places = list(range(len(results)))
+    ranks = list(range(len(results)))
     finals = np.concatenate([result.final for result in results])
     # Of the scores, in which a seed that failed counts as the worst, as in the means.
     tenths = np.transpose([np.quantile(result.scores, [0.1, 0.9]) for result in results])
@@ -38,8 +38,8 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
         ),
         data={
             "final": {
-                "configuration": places,
-                "place": places,
+                "configuration": ranks,
+                "place": ranks,
                 **means(results),
                 "tenth": short(tenths[0]),
                 "ninetieth": short(tenths[1]),
@@ -67,7 +67,7 @@ def _rows(findings: Findings) -> charts.Spec:
     tenths = {"x": charts.quantity("tenth"), "x2": {"field": "ninetieth"}}
     interval = {"x": charts.quantity("low"), "x2": {"field": "high"}}
     label = {"x": {"value": 2}, "text": {"field": "configuration"}}
-    above = {"align": "left", "baseline": "bottom", "dy": -9, "limit": {"expr": "width"}}
+    label_style = {"align": "left", "baseline": "bottom", "dy": -9, "limit": {"expr": "width"}}
     return {
         "data": {"name": "final"},
         "encoding": {"y": charts.quantity("place", **y)},
@@ -80,6 +80,6 @@ def _rows(findings: Findings) -> charts.Spec:
                     charts.layer("point", {"x": mean}, filled=True, size=75, opacity=1),
                 ],
             },
-            charts.layer("text", label, **above),
+            charts.layer("text", label, **label_style),
         ],
     }

@@ -34,8 +34,8 @@ def draw(findings: Findings) -> Iterator[charts.Chart]:
 def _lines(data: str, x: charts.Spec) -> charts.Spec:
     """Returns the means and their intervals; those that agree with the best stand out."""
 
-    def if_best(value: object, otherwise: object) -> charts.Spec:
-        return {"condition": {"test": "datum.best", "value": value}, "value": otherwise}
+    def if_best(value: object, other_value: object) -> charts.Spec:
+        return {"condition": {"test": "datum.best", "value": value}, "value": other_value}
 
     title = "mean final return"
     value = charts.quantity("value", title=title, scale={"zero": False, "padding": 8})
@@ -44,10 +44,10 @@ def _lines(data: str, x: charts.Spec) -> charts.Spec:
     tips = charts.tooltip(**{field: (name, ",.1f") for field, name in titles.items()})
     # ``others`` is a number of the values of all other settings: a line for each.
     line = {"y": value, "detail": {"field": "others"}, "strokeWidth": if_best(2.6, 1)}
-    paint = if_best("var(--series-0)", "var(--soft)")
+    line_color = if_best("var(--series-0)", "var(--soft)")
     return {
         "data": {"name": data},
-        "encoding": {"x": x, "color": paint, "opacity": if_best(1, 0.55)},
+        "encoding": {"x": x, "color": line_color, "opacity": if_best(1, 0.55)},
         "layer": [
             charts.layer("line", line),
             charts.layer("rule", interval, strokeWidth=2),
@@ -98,12 +98,12 @@ def _means_by_setting(findings: Findings, name: str) -> Table:
         tuple((k, repr(v)) for k, v in result.configuration.settings.items() if k != name)
         for result in results
     ]
-    numbers = {context: n for n, context in enumerate(dict.fromkeys(contexts))}
+    context_numbers = {context: n for n, context in enumerate(dict.fromkeys(contexts))}
     best = contexts[order.index(0)]
     return {
         "configuration": order,
         "setting": settings,
         **means(results),
-        "others": [numbers[context] for context in contexts],
+        "others": [context_numbers[context] for context in contexts],
         "best": [context == best for context in contexts],
     }

@@ -72,10 +72,10 @@ def _shares(findings: Findings) -> Table:
         # How many of the curve's steps lie at or before each point of the grid: 0 is its start.
         index = np.searchsorted(curve.steps, steps, side="right")
         # Kaplan and Meier's is the share that has not, so that the ends change places.
-        unsolved = {"share": curve.probability, "low": curve.high, "high": curve.low}
+        unsolved_shares = {"share": curve.probability, "low": curve.high, "high": curve.low}
         shares = {
             name: short(1 - np.concatenate([[1.0], share])[index], 4)
-            for name, share in unsolved.items()
+            for name, share in unsolved_shares.items()
         }
         return {"configuration": place, "env_steps": short(steps, 7), **shares}
 
