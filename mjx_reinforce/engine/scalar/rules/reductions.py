@@ -195,7 +195,7 @@ def _triangular_solve(graph: Graph, eqn: Equation, a: Array, b: Array) -> Result
     ]
     # The rows of the packed array are the solved columns: those of x, or of x' where the equation
     # was transposed.
-    x = arrays.pack(itertools.chain(*solved), (*batch, columns, size), aval.dtype)
+    x = arrays.pack(itertools.chain(*solutions), (*batch, columns, size), aval.dtype)
     if params["left_side"]:
         x = np.swapaxes(x, -1, -2)
     return [x]
