@@ -4,15 +4,22 @@ import dataclasses
 import functools
 import itertools
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from mjx_reinforce.console.interrupt import Interrupt
+from mjx_reinforce.runs.compile_times import keep_seconds
 from mjx_reinforce.runs.display import Display, SweepScreen
 from mjx_reinforce.runs.plan import GroupPlan, Plan
 from mjx_reinforce.runs.saving import Files
-from mjx_reinforce.setup.compile_times import keep_seconds
-from mjx_reinforce.training.driver import Driver, Observer, RunDriver, Runs, begin_run
+from mjx_reinforce.training.driver import (
+    Driver,
+    Observer,
+    RunDriver,
+    Runs,
+    begin_run,
+    sweep_summary,
+)
 from mjx_reinforce.training.record import Record
 from mjx_reinforce.training.slots import Compiled, Slots, Stopwatch, compile_slots, started
 
@@ -76,7 +83,7 @@ def conduct(
             break
     if plan.design.is_sweep:
         assert files is not None
-        summary = _sweep_summary(files.contents, driver, clock)
+        summary = sweep_summary(files.contents, driver, clock)
     else:
         assert isinstance(driver, RunDriver)
         # A signal after that changes nothing: what is left takes a second or two.
@@ -136,26 +143,6 @@ def _begin(
         observers=observers,
         interrupted=interrupted,
     )
-
-
-def _sweep_summary(
-    contents: Mapping[str, Any], driver: Driver | None, clock: Stopwatch
-) -> dict[str, Any]:
-    """Returns the contents of sweep.json at the end.
-
-    Args:
-      contents: of sweep.json so far.
-      driver: of the chunk that was trained last; None if nothing was left to train.
-      clock: of this process.
-    """
-    is_done = driver is None or driver.record.done()
-    return {
-        **contents,
-        "status": "finished" if is_done else "interrupted",
-        # A sweep that was resumed has spent time before, which its sweep.json says.
-        "compile_seconds": contents["compile_seconds"] + clock.compiling,
-        "run_seconds": contents["run_seconds"] + clock.running(),
-    }
 
 
 def _compiled(

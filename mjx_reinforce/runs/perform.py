@@ -228,10 +228,10 @@ def perform(
         try:
             configure_jax()
             from mjx_reinforce.envs.instability import instability
+            from mjx_reinforce.runs.compile_times import describe_compiling
             from mjx_reinforce.runs.conduct import conduct
             from mjx_reinforce.runs.plan import describe, make_plan
             from mjx_reinforce.runs.saving import RunFiles, SweepFiles
-            from mjx_reinforce.setup.compile_times import describe_compiling
         except MemoryError as error:
             raise ImportError(f"no memory is left {error}".strip()) from error
 

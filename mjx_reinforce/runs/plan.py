@@ -28,7 +28,7 @@ from mjx_reinforce.training.division import Division
 from mjx_reinforce.training.driver import Runs
 from mjx_reinforce.training.resume import Checkpoint
 from mjx_reinforce.training.slots import Stopwatch
-from mjx_reinforce.training.state import StateRows, last_actors
+from mjx_reinforce.training.state import last_actors
 
 
 class Group(NamedTuple):
@@ -105,16 +105,16 @@ def make_plan(
       ValueError: settings do not fit the environment, or it cannot go on here.
     """
     clock = Stopwatch()
-    if design.base.resume is not None:
+    config = design.base
+    checkpoint = None
+    if config.resume is not None:
         resume.check_same_program(design.directory, saved_record, provenance())
+        # A sweep has checkpoints, too, but one a chunk: its files look for them as it gets there.
+        if not design.is_sweep:
+            checkpoint = resume.newest_checkpoint(config, say)
     if design.is_sweep:
         group_plans, division = _plan_sweep(design, saved_record)
         return Plan(design, group_plans, division, saved_record, None, None, clock)
-    config = design.base
-    # A sweep has checkpoints, too, but one a chunk: its files look for them as it gets there.
-    checkpoint = None
-    if config.resume is not None:
-        checkpoint = resume.newest_checkpoint(config, say)
     division = divide_run(config)
     ready_programs = load_or_build_ready(config, design.default or config, env, division)
     actors = None
@@ -346,7 +346,7 @@ def _capacity(group: Group, ready_programs: Ready) -> int:
     """
     if group.num_runs <= _MIN_CHUNK_RUNS:
         return _MIN_CHUNK_RUNS
-    state_bytes = StateRows(ready_programs.programs().like).size
+    state_bytes = ready_programs.programs().state_bytes
     return max(1, int(_MEMORY_SHARE * host_memory() / (_NUM_COPIES * state_bytes)))
 
 

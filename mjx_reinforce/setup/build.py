@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import optax
 
@@ -33,13 +33,28 @@ from mjx_reinforce.setup.room import check_networks
 from mjx_reinforce.training import wrappers
 
 
+class Built(NamedTuple):
+    """What the settings describe in an environment.
+
+    learner: what trains the policy
+    horizon: the time limit of an episode in steps
+    training_horizon: that of a training episode, which may be lower
+    policy: how to rebuild the policy of the settings, see ``policy_files.save_policy``
+    """
+
+    learner: Learner
+    horizon: int
+    training_horizon: int
+    policy: dict[str, Any]
+
+
 def build(
     env: Environment,
     config: Config,
     policy: Policy | None = None,
     devices: Devices | None = None,
     num_seeds: int = 1,
-) -> tuple[Learner, int]:
+) -> Built:
     """Builds the learner that the settings describe.
 
     Args:
@@ -49,17 +64,15 @@ def build(
       devices: among which the episodes of an update are divided, of ``reinforce`` alone.
       num_seeds: how many a device trains at once, for whose networks there must be memory.
 
-    Returns:
-      The learner, and the horizon in env steps.
-
     Raises:
       ValueError: the settings do not fit the environment.
     """
     check_environment(env)
+    described_policy = policy_settings(env, config)
+    if policy is None:
+        policy = build_policy(described_policy)
     horizon = check_horizon(env, config.horizon)
     training_horizon = config.training_horizon(horizon)
-    if policy is None:
-        policy = build_policy(policy_settings(env, config))
     # First, so that settings that cannot fit are refused before anything is compiled.
     check_networks(env, config, policy, training_horizon, num_seeds)
     normalize_steps = config.normalize_steps
@@ -76,13 +89,13 @@ def build(
         learner = _call_choice("algorithm", config.algorithm, ALGORITHMS, env, config, **common)
         # What the user's code returns fails here in one line, not inside of a program.
         wrappers.check_learner(config.algorithm, learner)
-        return learner, horizon
+        return Built(learner, horizon, training_horizon, described_policy)
     algorithm = find_algorithm(config.algorithm)
     learner = load_definition(algorithm.make)(env, config, **common)
     # A search plays no ``Trajectory`` of one policy, which the wrappers take.
     if not algorithm.search_episodes:
-        learner = _for_many_seeds(learner, config, common["horizon"], devices)
-    return learner, horizon
+        learner = _for_many_seeds(learner, config, training_horizon, devices)
+    return Built(learner, horizon, training_horizon, described_policy)
 
 
 def policy_settings(env: Environment, config: Config) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from mjx_reinforce.learning.learner import Learner
 from mjx_reinforce.registry import is_own
 from mjx_reinforce.settings.config import CODE, Config, check_read_by_policy, marked
 from mjx_reinforce.settings.declare import Mark
-from mjx_reinforce.setup.build import build, policy_settings
+from mjx_reinforce.setup.build import build
 from mjx_reinforce.setup.provenance import provenance, version
 from mjx_reinforce.training.division import ALONE, Division
 from mjx_reinforce.training.programs import Programs, programs_of
@@ -128,7 +128,8 @@ def build_ready(
     width = 1
     if traced is None:
         width = division.width(config.num_seeds)
-    learner, horizon = build(env, config, devices=devices, num_seeds=width)
+    built = build(env, config, devices=devices, num_seeds=width)
+    learner = built.learner
     threshold = getattr(env, "reward_threshold", None)
     if threshold is not None:
         threshold = float(threshold)
@@ -138,10 +139,11 @@ def build_ready(
         if not settings:
             return learner
         if config.algorithm != "reinforce":
-            return build(env, dataclasses.replace(config, **settings))[0]
+            return build(env, dataclasses.replace(config, **settings)).learner
         # How REINFORCE plays depends on no traced number, and takes a second to write out.
         with warnings.catch_warnings(action="ignore"):  # this engine does not play
-            vmap_learner, _ = build(env, dataclasses.replace(config, engine="vmap", **settings))
+            vmap_config = dataclasses.replace(config, engine="vmap", **settings)
+            vmap_learner = build(env, vmap_config).learner
         return learner._replace(init=vmap_learner.init, learn=vmap_learner.learn)
 
     @functools.cache
@@ -150,7 +152,8 @@ def build_ready(
         return programs_of(
             env,
             build_learner,
-            horizon,
+            built.horizon,
+            built.training_horizon,
             config,
             width,
             traced or (),
@@ -159,9 +162,9 @@ def build_ready(
         )
 
     return Ready(
-        horizon=horizon,
+        horizon=built.horizon,
         threshold=threshold,
-        policy=policy_settings(env, config),
+        policy=built.policy,
         engine=learner.engine.name,
         why=learner.engine.why,
         programs=programs,

@@ -47,7 +47,8 @@ def check_networks(
             f"an update may have {num_steps:,} env steps ({config.episodes_per_update:,} episodes "
             f"of {horizon:,}), and fewer than 2^31 are counted; lower --num-episodes or --horizon"
         )
-    check_room(num_seeds * float(_of_seed(config, policy, observation_size(env), horizon)))
+    num_bytes = num_seeds * float(_of_seed(config, policy, observation_size(env), horizon))
+    check_room(num_bytes)
 
 
 def _of_seed(config: Config, policy: Policy, entries: int, horizon: int) -> int:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -14,7 +14,7 @@ from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.training.record import HOPELESS, Measured, Record, RunRecord
 from mjx_reinforce.training.resume import Checkpoint, decisive
-from mjx_reinforce.training.slots import Slots
+from mjx_reinforce.training.slots import Slots, Stopwatch
 from mjx_reinforce.training.state import Best, Budget, StateRows, begin_with, first_best, keep_best
 
 
@@ -339,6 +339,26 @@ class RunDriver(Driver):
             "best_updates": counts.to_int(self.best.num_updates).tolist(),
             **test,
         }
+
+
+def sweep_summary(
+    contents: Mapping[str, Any], driver: Driver | None, clock: Stopwatch
+) -> dict[str, Any]:
+    """Returns the contents of sweep.json at the end.
+
+    Args:
+      contents: of sweep.json so far.
+      driver: of the chunk that was trained last; None if nothing was left to train.
+      clock: of this process.
+    """
+    is_done = driver is None or driver.record.done()
+    return {
+        **contents,
+        "status": "finished" if is_done else "interrupted",
+        # A sweep that was resumed has spent time before, which its sweep.json says.
+        "compile_seconds": contents["compile_seconds"] + clock.compiling,
+        "run_seconds": contents["run_seconds"] + clock.running(),
+    }
 
 
 def begin_run(

@@ -280,6 +280,11 @@ class Programs(NamedTuple):
     like: RunState
     division: Division = ALONE
 
+    @property
+    def state_bytes(self) -> int:
+        """How many bytes the state of a run takes."""
+        return StateRows(self.like).size
+
 
 #: The metrics that say how far a run is, and which of its updates broke.
 _PROGRESS_METRICS = ("active", "env_steps", "nonfinite_episodes", "skipped_update")
@@ -308,6 +313,7 @@ def programs_of(
     env: Environment,
     build_learner: BuildLearner,
     horizon: int,
+    training_horizon: int,
     config: Config,
     num_runs: int,
     traced: Collection[str] = (),
@@ -321,6 +327,7 @@ def programs_of(
       env: what is trained on.
       build_learner: called while the settings of one run are traced, and without any.
       horizon: T, the time limit of an episode in steps.
+      training_horizon: that of a training episode.
       config: the settings, in which those that are traced stand for any value.
       num_runs: R, of the shapes; those of one device.
       traced: the names of the settings that differ from run to run.
@@ -330,9 +337,7 @@ def programs_of(
     """
     learner = build_learner({})  # policies and engines are those of any
     # A launch has one horizon, and an evaluation plays to that of the environment.
-    advance_evaluates = (
-        isinstance(learner.play, SharedLaunch) and config.training_horizon(horizon) == horizon
-    )
+    advance_evaluates = isinstance(learner.play, SharedLaunch) and training_horizon == horizon
 
     states = _states_of_runs(build_learner)
 

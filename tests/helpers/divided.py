@@ -51,7 +51,7 @@ def trained(config, division):
 def stepped(config, division):
     """Returns the episodes of an update of all seeds, and what each has learned from its own."""
     devices = division.devices() if division.episodes > 1 else None
-    learner = build.build(envs.make(config.env), config, devices=devices)[0]
+    learner = build.build(envs.make(config.env), config, devices=devices).learner
 
     @jax.jit
     @jax.vmap

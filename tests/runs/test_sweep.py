@@ -175,7 +175,7 @@ def test_numbers_of_shifts_dampings_and_values_are_traced(monkeypatch):
     together = jax.jit(jax.vmap(lambda settings: trained(builder(settings))))(group.settings)
     found = []
     for number, config in enumerate(design.configs):
-        alone = jax.jit(lambda config=config: trained(build(Drift(), config)[0]))()
+        alone = jax.jit(lambda config=config: trained(build(Drift(), config).learner))()
         jax.tree.map(
             lambda x, y, number=number: np.testing.assert_allclose(x[number], y, atol=1e-4),
             together,
@@ -499,8 +499,8 @@ def test_the_policies_of_the_best_and_the_worst_seed_are_kept(run):
         assert choose_seed(known, "worst") == worst
         assert choose_seed(known, "best") == best
         config = Config(env="Drift-v0", num_seeds=5, eval_episodes=2, hidden_sizes=(4,))
-        learner, horizon = build(env, config)
-        made = programs_of(env, lambda _, x=learner: x, horizon, config, 1, all_metrics=False)
+        learner, *horizons, _ = build(env, config)
+        made = programs_of(env, lambda _, x=learner: x, *horizons, config, 1, all_metrics=False)
         evaluate, layout = jax.jit(made.evaluate), StateRows(made.like)
         for seed in known.seeds:
             actor = jax.tree.map(lambda x: x[None], load_seed(known, seed)[0].actor)

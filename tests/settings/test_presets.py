@@ -57,7 +57,7 @@ def test_every_preset_makes_sense():
             config, horizon=7
         )
         small = dataclasses.replace(config, num_seeds=1, horizon=7, engine="vmap")
-        learner, _ = build(envs.make(config.env), small)
+        learner = build(envs.make(config.env), small).learner
         before = jax.eval_shape(learner.init, jax.random.key(0))
         after, _ = jax.eval_shape(learner.step, before)
         assert jax.tree.structure(after) == jax.tree.structure(before), name
@@ -92,7 +92,7 @@ def test_network_outputs_mean_what_they_do_in_the_program(name, std):
 def test_first_weights_are_pytorchs(name):
     """Uniform within 1 / sqrt(fan-in), biases too; the critic's as well."""
     config = PRESETS[name][1]
-    learner, _ = build(envs.make(config.env), config)
+    learner = build(envs.make(config.env), config).learner
     state = jax.vmap(learner.init)(jax.random.split(jax.random.key(0), 50))
     params = [state.actor.params["network"]["params"]]
     if name == "baseline-truncated-normal":

@@ -25,8 +25,9 @@ from mjx_reinforce.engine.cpu import machine, seam
 from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.gpu import seam as gpu
 from mjx_reinforce.engine.gpu.source import Launch
+from mjx_reinforce.runs import compile_times
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.setup import compile_times, ready
+from mjx_reinforce.setup import ready
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=4000, eval_episodes=2)
 

@@ -98,10 +98,18 @@ def train(case: Case, config: Config, *, stale: bool = False) -> np.ndarray:
     env = envs.make(config.env)
     published = dataclasses.replace(config, algorithm=PRESETS[case.preset][1].algorithm)
     policy = build_policy(policy_settings(env, published))
-    learner, horizon = build(env, config, policy)
+    built = build(env, config, policy)
+    learner = built.learner
     if stale:
-        learner = stale_starts(lambda env: build(env, config, policy)[0], env)
-    programs = programs_of(env, lambda _: learner, horizon, config, config.num_seeds)
+        learner = stale_starts(lambda env: build(env, config, policy).learner, env)
+    programs = programs_of(
+        env,
+        lambda _: learner,
+        built.horizon,
+        built.training_horizon,
+        config,
+        config.num_seeds,
+    )
     compiled = compile_slots(programs, config, config.num_seeds)
     slots = Slots(compiled, config.first_seed + np.arange(config.num_seeds))
     scores = []
