@@ -104,7 +104,7 @@ def short_scan(step: Callable, init: PyTree, xs: PyTree) -> Any:
     return jax.lax.scan(step, init, xs, unroll=length <= (_UNROLLED.value or 0))
 
 
-#: Traced where it is written out. Its operands are the predicate, the leaves of ``otherwise``, and
+#: Traced where it is written out. Its operands are the predicate, the leaves of ``default``, and
 #: what the computation reads.
 _SKIPPABLE = core.Primitive("skippable")
 _SKIPPABLE.multiple_results = True
