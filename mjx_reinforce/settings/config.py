@@ -147,9 +147,13 @@ def check_each(config: Config) -> None:
         _check_installed(name)
     envs.check_id(config.env)
     split_words(config.env_set)
-    check_choice("algorithm", config.algorithm, ALGORITHMS)
-    check_choice("policy", config.policy, {"auto": None} | DISTRIBUTIONS)
-    check_choice("estimator", config.estimator, ESTIMATORS)
+    choices = {
+        "algorithm": ALGORITHMS,
+        "policy": {"auto": None} | DISTRIBUTIONS,
+        "estimator": ESTIMATORS,
+    }
+    for kind, definitions in choices.items():
+        check_choice(kind, getattr(config, kind), definitions)
     for rule in Range:
         for name in marked(rule):
             value = getattr(config, name)
