@@ -57,7 +57,7 @@ def watched(tmp_path, monkeypatch):
         (saving, "write_json", lambda path, _: path.name),
         (saving, "save_policy", lambda folder, actor, settings: f"{actor} policies"),
         (saving.files, "append", lambda path, _: path.name),
-        (saving.resume, "save", lambda _, x, even: f"checkpoint of {x.seconds}"),
+        (saving.resume, "save", lambda _, x, is_even: f"checkpoint of {x.seconds}"),
     ):
         monkeypatch.setattr(owner, name, lambda *x, what=what, **more: write(what(*x, **more)))
     monkeypatch.setattr(saving.curves, "picture", lambda *given: b"png")
