@@ -62,6 +62,9 @@ def no_run_goes_on():
 
 def start(directory, *arguments, cache=None):
     environment = os.environ | {"PYTHONWARNINGS": "ignore:JAX 0.10.2 computes some products"}
+    # GLFW, which MuJoCo imports to draw, starts a Python of its own for a moment. Where a signal
+    # meets that one, it shows a traceback of glfw/library.py (glfw 2.11).
+    environment |= {"MUJOCO_GL": "disable"}
     environment |= {"JAX_COMPILATION_CACHE_DIR": str(cache)} if cache else {}
     process = subprocess.Popen(
         [sys.executable, "-m", "mjx_reinforce.train", *map(str, arguments)],
