@@ -128,7 +128,7 @@ def make_vec(
         "same_step" are Gymnasium's, whose ``AutoresetMode`` may be given; with "disabled" only
         ``restart`` does.
       max_episode_steps: the time limit in steps; by default the task's.
-      engine: "auto", "native" (machine code) or "vmap".
+      engine: "auto", "native" (machine code), "vmap", or "mujoco" (C MuJoCo).
       **settings: of the task, where ``env`` is an id.
 
     Raises:

@@ -10,12 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import Env, State
-from flax import struct
 from mujoco import mjMAXVAL, mjx  # pyright: ignore[reportAttributeAccessIssue] (a C extension)
 
 from mjx_reinforce.engine.base import (
     Box,
-    MjModel,
     PhysicsModel,
     is_kept_whole,
     observation_size,
@@ -26,49 +24,11 @@ from mjx_reinforce.engine.physics import mjx_internals, sensors
 from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
 from mjx_reinforce.engine.scalar import prune, whole
-from mjx_reinforce.envs import models
+from mjx_reinforce.envs import in_batch, models, refusals
 from mjx_reinforce.envs.outcomes import check_centers, check_episode, check_outcome, check_start
-from mjx_reinforce.envs.parts import Named, View
+from mjx_reinforce.envs.parts import View
 from mjx_reinforce.envs.settings import EpisodeSettings, build_settings
-
-
-@struct.dataclass(kw_only=True)
-class Physics:
-    """What the next physics step needs (``models.CARRIED``); the rest of mjx.Data follows from it.
-
-    time: [] since the start of the episode (s)
-    qpos: [nq] generalized positions (m, rad)
-    qvel: [nv] generalized velocities (m/s, rad/s)
-    act: [na] activations of the actuators that have a state
-    qacc_warmstart: [nv] where the constraint solver starts (m/s^2, rad/s^2)
-    carried: fields of the last step's mjx.Data that the next outcome reads, by their names
-    episode: what ``MujocoEnv.randomize`` returned
-    """
-
-    time: jax.Array
-    qpos: jax.Array
-    qvel: jax.Array
-    act: jax.Array
-    qacc_warmstart: jax.Array
-    carried: dict[str, jax.Array] = struct.field(default_factory=dict)
-    episode: dict[str, jax.Array] = struct.field(default_factory=dict)
-
-
-class Before(Named, Simulation):
-    """What is known of the start of an env step, under MuJoCo's own names."""
-
-    def __init__(self, fields: dict[str, jax.Array], mj_model: MjModel, episode: dict[str, Any]):
-        """Shows these fields of mjData; any other raises AttributeError when it is read."""
-        vars(self).update(fields)
-        self.mj_model = mj_model
-        self.episode = episode
-
-    def __getattr__(self, name: str) -> Any:
-        raise AttributeError(
-            f"before.{name} is not known, since nothing kept it from the env step before; "
-            f"write carried = ({name!r},) in the class of the task"
-        )
-
+from mjx_reinforce.envs.state import Before, Physics
 
 #: A forward pass of C MuJoCo 4.0.
 _forward = mjx_internals.fenced(physics.forward)
@@ -141,10 +101,12 @@ class MujocoEnv(Env):
         self.max_episode_steps = self.settings.max_episode_steps
         self.reward_threshold = self.settings.reward_threshold
         self.mj_model = models.load_model(self.settings.xml_file)
-        self.model = models.to_mjx(self.mj_model, self.settings.xml_file)
-        # Tracing the physics takes a second of Python; jit does it once.
-        self._forward = jax.jit(functools.partial(_forward, self.model))
-        self._physics_step = jax.jit(_step_of(self.model, self._forward))
+        try:
+            self._model = models.to_mjx(self.mj_model, self.settings.xml_file)
+            self.refusal = None
+        except refusals.UnsupportedError as error:  # C MuJoCo may play it
+            self._model = None
+            self.refusal = str(error)
         self._start = jax.jit(prune(self._forward_state))
         # A range that is written without a limit counts for nothing in MuJoCo.
         low, high = np.array(self.mj_model.actuator_ctrlrange).T
@@ -203,9 +165,9 @@ class MujocoEnv(Env):
         # A task that draws nothing consumes no key for it, so that its starts are those of ``rng``.
         if type(self).randomize is not MujocoEnv.randomize:
             key, rng = jax.random.split(rng)
-            episode = check_episode(name, self.randomize(key), self.model)
+            episode = check_episode(name, self.randomize(key), self.mj_model)
             if "body_ipos" in episode:
-                check_centers(name, self.randomize, self.model.body_ipos, self.mj_model)
+                check_centers(name, self.randomize, self.mj_model.body_ipos, self.mj_model)
         sizes = self.mj_model.nq, self.mj_model.nv
         return episode, check_start(name, self.initial(rng), sizes)
 
@@ -221,10 +183,54 @@ class MujocoEnv(Env):
         """
         check_shape("qpos", qpos, (self.mj_model.nq,))
         check_shape("qvel", qvel, (self.mj_model.nv,))
+        # What MJX refuses, C MuJoCo plays, whoever asks.
+        if self.refusal is not None:
+            return self._in_c_mujoco.set_state(qpos, qvel, episode or {})
         # Whether the physics stays whole is asked during tracing, and the jitted start may have
         # been traced where it does not.
         start = self._forward_state if is_kept_whole() else self._start
         return start(qpos, qvel, episode or {})
+
+    @property
+    def model(self) -> mjx.Model:
+        """MJX's version of the model.
+
+        Raises:
+          UnsupportedError: MJX cannot simulate it as C MuJoCo does; the message has every reason.
+        """
+        if self._model is None:
+            raise refusals.UnsupportedError(self.refusal)
+        return self._model
+
+    # Tracing the physics takes a second of Python; jit does it once.
+    @functools.cached_property
+    def _forward(self) -> Callable[..., Any]:
+        return jax.jit(functools.partial(_forward, self.model))
+
+    @functools.cached_property
+    def _physics_step(self) -> Callable[..., Any]:
+        return jax.jit(_step_of(self.model, self._forward))
+
+    def in_c_mujoco(self) -> Env:
+        """Returns this task with its physics computed by C MuJoCo, on all cores of the CPU.
+
+        Raises:
+          ValueError: the task has a ``reset`` or ``step`` of its own, or reads what C MuJoCo has in
+            no array of a fixed size.
+        """
+        task = type(self)
+        if (task.reset, task.step) != (MujocoEnv.reset, MujocoEnv.step):
+            raise ValueError(f"{task.__name__} has steps of its own, which MuJoCo does not know")
+        return self._in_c_mujoco
+
+    @functools.cached_property
+    def _in_c_mujoco(self) -> in_batch.InBatch:
+        return in_batch.InBatch(self)
+
+    @functools.cached_property
+    def best_in_c_mujoco(self) -> str | None:
+        """Why nothing simulates this model faster than C MuJoCo, in a few words; None if else."""
+        return refusals.best_in_c(self.mj_model)
 
     def _physics_of(self, episode: dict[str, jax.Array]) -> tuple[Any, Any]:
         """Returns the forward pass and the step of the model as it is in an episode."""
@@ -262,6 +268,8 @@ class MujocoEnv(Env):
         The reward is NaN where C MuJoCo would have reset the simulation, see ``_is_sound``.
         """
         check_shape("the action", action, (self.action_size,))
+        if self.refusal is not None:
+            return self._in_c_mujoco.step(state, action)
         before = cast(Any, state.pipeline_state)
         # All else in mjData follows from what is carried, or stays as the model has it.
         start_data = models.make_data(self.mj_model).replace(**_carried(before))

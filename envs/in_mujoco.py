@@ -8,11 +8,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_reinforce.engine.base import Environment, MjModel
-from mjx_reinforce.engine.physics.mjx_internals import Simulation
+from mjx_reinforce.engine.base import Environment
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import Before, MujocoEnv
-from mjx_reinforce.envs.parts import View
+from mjx_reinforce.envs.in_batch import FieldRecorder, spec_of
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco
@@ -23,23 +22,6 @@ _RESETS = (_C.mjtWarning.mjWARN_BADQPOS, _C.mjtWarning.mjWARN_BADQVEL, _C.mjtWar
 def was_reset(data: Any) -> bool:
     """Returns whether C MuJoCo reset an ``MjData``, of which a number was NaN or beyond 1e10."""
     return any(data.warning[kind].number for kind in _RESETS)
-
-
-class _Recorder(View):
-    """An mjData of zeros that remembers which of its fields were read."""
-
-    def __init__(self, sizes: Simulation, mj_model: MjModel):
-        super().__init__(None, mj_model, {})
-        self.sizes = sizes
-        self.fields_read = set()
-
-    def __getattr__(self, name: str) -> jax.Array:
-        """Returns zeros in the shape that MJX gives the field, and remembers its name."""
-        shape = getattr(self.sizes, name)
-        if not hasattr(shape, "dtype"):
-            raise ValueError(f"the task reads {name}, which is not an array of mjData")
-        self.fields_read.add(name)
-        return jnp.zeros(shape.shape, shape.dtype)
 
 
 class InMujoco:
@@ -55,8 +37,8 @@ class InMujoco:
         """Finds out which fields of mjData the task reads; simulates nothing.
 
         Raises:
-          ValueError: the task has a ``reset`` or ``step`` of its own, or reads what C MuJoCo keeps
-            in arrays of another size.
+          ValueError: the task has a ``reset`` or ``step`` of its own, or reads what C MuJoCo has
+            in no array of a fixed size.
         """
         task = type(env)
         methods = (MujocoEnv.reset, MujocoEnv.step)
@@ -66,8 +48,7 @@ class InMujoco:
         self.model = env.mj_model
         self.data = _C.MjData(env.mj_model)
         self._episode, _ = jax.eval_shape(env.draw, jax.random.key(0))
-        self._sizes = Simulation(jax.eval_shape(lambda: models.make_data(env.mj_model)))
-        recorder = _Recorder(self._sizes, env.mj_model)
+        recorder: Any = FieldRecorder(self.data, env.mj_model)
 
         # Which fields a task reads does not depend on their numbers: it is traced, as under jit.
         def read(before, episode, action):
@@ -76,8 +57,7 @@ class InMujoco:
             return outcome, env.observe(recorder)
 
         jax.eval_shape(read, self._start_fields(), self._episode, jnp.zeros(env.action_size))
-        self._names = sorted(recorder.fields_read)
-        self._fields()  # raises for those of another size
+        self._names = sorted(recorder.names)
         self._start = jax.jit(env.draw)
         self._observe = jax.jit(lambda fields, episode: env.observe(self._view(fields, episode)))
         self._advance = jax.jit(self._outcome)
@@ -131,7 +111,7 @@ class InMujoco:
         return Before(fields, self.env.mj_model, episode)
 
     def _fields(self) -> dict[str, np.ndarray]:
-        """Returns what the task reads of the simulation, in the shapes that MJX has."""
+        """Returns what the task reads of the simulation, in the shapes that tasks read."""
         return {name: self._field(name) for name in self._names}
 
     def _start_fields(self) -> dict[str, np.ndarray]:
@@ -140,9 +120,5 @@ class InMujoco:
         return {name: self._field(name) for name in field_names}
 
     def _field(self, name: str) -> np.ndarray:
-        shape = getattr(self._sizes, name)
-        value = np.array(getattr(self.data, name))
-        # MJX has a fixed number of contacts and constraints, C those that there are.
-        if value.size != np.prod(shape.shape, dtype=int):
-            raise ValueError(f"the task reads {name}, whose size in MuJoCo changes")
-        return value.reshape(shape.shape).astype(shape.dtype)
+        spec = spec_of(self.data, name)
+        return np.array(getattr(self.data, name)).reshape(spec.shape).astype(spec.dtype)

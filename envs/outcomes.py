@@ -1,11 +1,13 @@
 """Checks of what a task's methods return, while they are traced."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from mujoco import mjx
 
 from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.checks import require
@@ -13,6 +15,8 @@ from mjx_reinforce.engine.contract import check_shape, in_words, shape_of
 from mjx_reinforce.envs.models import RANDOM
 from mjx_reinforce.envs.refusals import UnsupportedError
 
+#: The names of an ``mjx.Model``, which no quantity of a task may have.
+_MODEL_FIELDS = frozenset(field.name for field in dataclasses.fields(cast(Any, mjx.Model)))
 #: So many draws show what a task moves.
 _DRAWS = 8
 
@@ -43,7 +47,7 @@ def check_episode(name: str, episode: object, model: MjModel) -> dict[str, jax.A
     Args:
       name: of the task.
       episode: what it returned.
-      model: the ``mjx.Model`` of which it may replace fields.
+      model: the ``MjModel`` of which it may replace fields.
 
     Raises:
       ValueError: it is something else, or replaces what cannot be replaced.
@@ -56,7 +60,7 @@ def check_episode(name: str, episode: object, model: MjModel) -> dict[str, jax.A
         quantity = f"{key!r} of {name}.randomize"
         require(shape_of(value) is not None, f"{quantity} must be an array, got {in_words(value)}")
         require(
-            key in RANDOM or not hasattr(model, key),
+            key in RANDOM or key not in _MODEL_FIELDS,
             f"{name}.randomize cannot replace {key} of the model; it can replace "
             f"{', '.join(RANDOM)}; a quantity of another kind needs another name",
         )
@@ -65,7 +69,7 @@ def check_episode(name: str, episode: object, model: MjModel) -> dict[str, jax.A
         if key in RANDOM:
             field = getattr(model, key)
             check_shape(quantity, value, field.shape)
-            arrays[key] = arrays[key].astype(field.dtype)
+            arrays[key] = arrays[key].astype(jnp.result_type(float))
     return arrays
 
 

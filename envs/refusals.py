@@ -281,3 +281,19 @@ def _listed(names: Sequence[str]) -> str:
     if num_unnamed > 0:
         text += f", and {num_unnamed:,} more"
     return text
+
+
+def best_in_c(model: MjModel) -> str | None:
+    """Returns in a few words why C MuJoCo plays a model best; None if machine code plays it faster.
+
+    MJX may not run the model as C MuJoCo does, or leave it to MJX's own solver, which is slow: this
+    package's solvers know pyramidal cones, joint limits, equalities and friction losses.
+    """
+    reasons = [*dict.fromkeys(feature for feature, _ in _reasons(model))]
+    if len(reasons) > 1:
+        return f"{reasons[0]}, and {len(reasons) - 1} more"
+    if reasons:
+        return reasons[0]
+    if model.opt.cone == _C.mjtCone.mjCONE_ELLIPTIC and any(geom_pairs(model)):
+        return "elliptic cones"
+    return None

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.engine.episode import begin, hold, step
+from mjx_reinforce.engine.play.choice import environment_of
 from mjx_reinforce.envs.in_mujoco import InMujoco
 from mjx_reinforce.export.policy_files import Player
 from mjx_reinforce.learning.policy import act
@@ -48,6 +49,8 @@ def simulator(env: "Environment", player: Player, horizon: int) -> Simulator:
       player: the policy.
       horizon: T, the time limit in steps.
     """
+    # Here too C MuJoCo computes the physics where nothing else is faster.
+    env, _ = environment_of("auto", env)
     unclipped = player.policy.distribution
 
     def sample(*inputs: jax.Array) -> jax.Array:

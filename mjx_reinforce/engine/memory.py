@@ -1,4 +1,4 @@
-"""How much memory this machine has, and bytes in words. JAX is not imported."""
+"""How much memory and how many cores this machine has, and bytes in words; without JAX."""
 
 import os
 from pathlib import Path
@@ -23,3 +23,12 @@ def gigabytes(size: float) -> str:
         return f"{max(1, round(size / 1e6))} MB"
     decimals = 1 if size < 1e10 else 0
     return f"{size / 1e9:,.{decimals}f} GB"
+
+
+def num_cores() -> int:
+    """Returns how many CPU cores this process may use."""
+    # A container or taskset allows fewer than there are; macOS cannot say.
+    affinity = getattr(os, "sched_getaffinity", None)
+    if affinity:
+        return len(affinity(0))
+    return os.cpu_count() or 1

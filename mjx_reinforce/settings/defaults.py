@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from mjx_reinforce.engine.checks import whole_number
+from mjx_reinforce.engine.memory import num_cores  # noqa: F401 (its users find it here)
 from mjx_reinforce.settings.config import CODE, Config, spoken
 
 
@@ -137,15 +138,6 @@ def of_task(
     period = min(budget // _EVALUATIONS, minute_steps // _PER_MINUTE)
     period //= config.episodes_per_update * config.training_horizon(HORIZONS[env])
     return dataclasses.replace(config, eval_every=max(config.eval_every, period))
-
-
-def num_cores() -> int:
-    """Returns how many CPU cores this process may use."""
-    # A container or taskset allows fewer than there are; macOS cannot say.
-    affinity = getattr(os, "sched_getaffinity", None)
-    if affinity:
-        return len(affinity(0))
-    return os.cpu_count() or 1
 
 
 def has_gpu() -> bool:

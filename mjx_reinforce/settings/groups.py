@@ -117,11 +117,11 @@ class RunSettings:
     """Cut training episodes, not evaluations, after this many env steps."""
     whole_after: float = _for_gradients(1.0, Range.SHARE, Reader.CUT)
     """Share of the budget after which --train-horizon no longer cuts episodes."""
-    engine: Literal["auto", "vmap", "native"] = setting(
+    engine: Literal["auto", "vmap", "native", "mujoco"] = setting(
         "auto", once="it changes no result but by rounding"
     )
     """How episodes are played: vmap (jax.vmap of the step), native (machine code for this CPU or
-    NVIDIA GPU), or auto, the fastest here."""
+    NVIDIA GPU), mujoco (C MuJoCo on the CPU's cores), or auto, the fastest here."""
     like: Path | None = setting(None, Mark.PLACE, once="every configuration begins with it")
     """Take all settings from this run, except those on the command line."""
     init_from: str | None = setting(None, Mark.NOT_COMPILED, once="it is for one run")

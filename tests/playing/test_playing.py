@@ -109,7 +109,7 @@ class Stepping(Pole):
 
 def test_what_c_mujoco_cannot_play_is_named():
     for env, said in (
-        (Contacts(), "reads efc_force, whose size in MuJoCo changes"),
+        (Contacts(), "reads efc_force, which is not an array of mjData of a fixed size"),
         (Stepping(), "Stepping has steps of its own"),
         (envs.make("CartPole-v1"), "CartPole has steps of its own"),
     ):

@@ -2,7 +2,8 @@
 
 ``vmap`` maps the environment's step with ``jax.vmap``. ``native`` writes out the whole step, policy
 included, in scalars (``engine.scalar``), and repeats it in machine code for a CPU or in a kernel
-for an NVIDIA GPU (``engine.cpu``, ``engine.gpu``). Trajectories agree up to rounding.
+for an NVIDIA GPU (``engine.cpu``, ``engine.gpu``). ``mujoco`` maps the step too, of which C MuJoCo
+computes the physics, on the cores of the CPU. Trajectories agree up to rounding.
 ``choose`` is for episodes, ``map_function`` for a function of one environment over many.
 """
 
@@ -20,7 +21,7 @@ from mjx_reinforce.engine import base
 from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory
 from mjx_reinforce.engine.checks import check_count, check_key, check_name, check_parts
 from mjx_reinforce.engine.contract import check_policy
-from mjx_reinforce.engine.play import available, native, program, rollouts
+from mjx_reinforce.engine.play import available, c_mujoco, native, program, rollouts
 from mjx_reinforce.engine.play import teams as team
 
 #: This JAX multiplies wrongly on CPUs, in some functions that are mapped over some 16,000 rows and
@@ -49,7 +50,7 @@ class ActingPolicy(NamedTuple):
 class Engine(NamedTuple):
     """A way to play episodes.
 
-    name: "vmap" or "native"
+    name: "vmap", "native" or "mujoco"
     why: the reason it was chosen, for people
     rollout: as ``mjx_reinforce.engine.play.rollouts.vmap_rollout``
     seconds: wall time that making it took, most of it for machine code
@@ -64,7 +65,7 @@ class Engine(NamedTuple):
         return f"Engine({self.name})"
 
 
-ENGINES = ("auto", "vmap", "native")
+ENGINES = ("auto", "vmap", "native", "mujoco")
 
 
 def choose(
@@ -83,6 +84,11 @@ def choose(
       ValueError: the name is unknown, or the engine does not support the environment.
     """
     start_time = time.perf_counter()
+    check_name("engine", name, dict.fromkeys(ENGINES))
+    in_c = _in_c_mujoco(name, env)
+    if in_c is not None:
+        task, reason = in_c
+        return Engine("mujoco", reason, _rollout_in_c(task), time.perf_counter() - start_time)
 
     def in_machine_code() -> Rollout | str:
         if policy is None or horizon is None:
@@ -96,6 +102,44 @@ def choose(
     if engine_name == "native" and available.platform() == "gpu":
         reason += f", {team.played_by(env)}"
     return Engine(engine_name, reason, rollout, time.perf_counter() - start_time)
+
+
+def _in_c_mujoco(name: str, env: Environment) -> tuple[Environment, str] | None:
+    """Returns what C MuJoCo plays and the reason; None if another engine is asked for or faster.
+
+    Args:
+      name: one of ``ENGINES``.
+      env: what is played.
+
+    Raises:
+      ValueError: it is asked for by name, and cannot play this.
+    """
+    refusal = getattr(c_mujoco.innermost(env), "refusal", None)
+    if refusal is not None and name in ("vmap", "native"):
+        raise ValueError(f"the {name} engine cannot play this: {refusal}; choose auto")
+    reason = c_mujoco.why_best(env)
+    if name != "mujoco" and (name != "auto" or reason is None):
+        return None
+    task = c_mujoco.played_by_c(env)
+    if isinstance(task, str):
+        if name == "mujoco":
+            raise ValueError(f"the engine mujoco cannot play this: {task}; choose auto")
+        return None
+    if name == "mujoco":
+        reason = "chosen by name"
+    return task, c_mujoco.in_words(str(reason))
+
+
+def _rollout_in_c(task: Any) -> Rollout:
+    """Returns the rollout of an environment that C MuJoCo steps; the one it is given is ignored."""
+    # A wrapper may offer the names of what it is around, but its own step is more than that one's.
+    env_step = task.step_unfinished if hasattr(type(task), "step_unfinished") else task.step
+    mapped_step = jax.vmap(env_step, in_axes=-1, out_axes=-1)
+
+    def play(_: Environment, *arguments: Any, **options: Any) -> Trajectory:
+        return rollouts.vmap_rollout(task, *arguments, env_step=mapped_step, **options)
+
+    return play
 
 
 def pick(
@@ -149,7 +193,7 @@ def _from_any_key(
 class MapEngine(NamedTuple):
     """A way to map a function.
 
-    name: "vmap" or "native"
+    name: "vmap", "native" or "mujoco"
     why: the reason it was chosen, for people
     call: the function of a batch, whose first axis of every array is N
     """
@@ -160,6 +204,23 @@ class MapEngine(NamedTuple):
 
     def __repr__(self) -> str:
         return f"MapEngine({self.name})"
+
+
+def environment_of(name: str, env: Environment) -> tuple[Environment, str | None]:
+    """Returns what an engine maps functions of, and why C MuJoCo computes its physics.
+
+    Args:
+      name: one of ``ENGINES``.
+      env: the environment.
+
+    Returns:
+      The environment with its physics computed by C MuJoCo, and the reason; or itself, and None.
+
+    Raises:
+      ValueError: the name is unknown, or the engine cannot play this.
+    """
+    check_name("engine", name, dict.fromkeys(ENGINES))
+    return _in_c_mujoco(name, env) or (env, None)
 
 
 def map_function(
@@ -229,8 +290,9 @@ def rollout(
       key: consumed; [N] the episodes' own, or [] and that of episode i is this one folded with i.
       num_episodes: N.
       horizon: T, the time limit in steps; reaching it ends an episode.
-      engine: "auto"; "native" or "vmap". With "auto" a small policy is played in
-        machine code, policy and all; a larger one by XLA, with the env step in machine code.
+      engine: "auto"; "native", "vmap" or "mujoco". With "auto" a small policy is played in
+        machine code, policy and all; a larger one by XLA, with the env step in machine code. What
+        neither plays fast, C MuJoCo plays.
       deterministic: [] or [N] whether an episode takes the mode.
       active: [] or [N] whether an episode is played: else it has no step, and zeros stand for it.
 
@@ -281,8 +343,9 @@ def rollout(
 def _rollout_of(engine: str, env: Environment, policy: ActingPolicy, horizon: int) -> Rollout:
     """Returns the rollout of an engine."""
     num_parameters = sum(np.size(x) for x in jax.tree.leaves(policy.actor))
-    on_cpu = available.platform() == "cpu"
-    if engine == "auto" and num_parameters > _MAX_PARAMETERS and on_cpu:
+    # Whatever is best in C MuJoCo has no step in machine code, or a slow one.
+    has_fast_step = available.platform() == "cpu" and c_mujoco.why_best(env) is None
+    if engine == "auto" and num_parameters > _MAX_PARAMETERS and has_fast_step:
         start = base.shapes(env.reset, jax.random.key(0))
         step = machine_code(env, env.step, start, base.null_action(env))
         if not isinstance(step, str):

@@ -30,7 +30,7 @@ from mjx_reinforce.engine.checks import check_count, check_key, check_name, chec
 from mjx_reinforce.engine.contract import check_environment, check_shape
 from mjx_reinforce.engine.memory import gigabytes, host_memory
 from mjx_reinforce.engine.play.available import GENERATOR
-from mjx_reinforce.engine.play.choice import MapEngine, map_function
+from mjx_reinforce.engine.play.choice import MapEngine, environment_of, map_function
 from mjx_reinforce.engine.play.counter import key_of_words
 
 #: When an environment whose episode has ended begins the next (Gymnasium's ``AutoresetMode``).
@@ -220,7 +220,8 @@ class VectorEnv:
         self.autoreset = autoreset
         self.max_episode_steps = max_episode_steps
         self.action_space: Box | Discrete = action_space(env)
-        self._blank = blank(env)
+        task, reason_for_c = environment_of(engine, env)
+        self._blank = blank(task)
         # What is continuous is in JAX's precision, float64 where ``jax_enable_x64`` is set.
         zeros = null_action(env)
         dtype = jnp.result_type(float) if zeros.ndim else zeros.dtype
@@ -229,11 +230,13 @@ class VectorEnv:
         self.action_size = env.action_size
         # Before the step is compiled, which takes seconds to minutes.
         self._check_memory()
-        advance = advance_function(env, max_episode_steps, autoreset)
+        advance = advance_function(task, max_episode_steps, autoreset)
         flag = jax.ShapeDtypeStruct((), bool)
-        self.engine: MapEngine = map_function(
-            engine, env, advance, self._blank, self._null_action, flag
-        )
+        self.engine: MapEngine
+        if reason_for_c is None:
+            self.engine = map_function(engine, task, advance, self._blank, self._null_action, flag)
+        else:
+            self.engine = MapEngine("mujoco", reason_for_c, jax.vmap(advance))
         self._call = jax.jit(self.engine.call)
 
     def reset(self, key: jax.Array) -> VectorState:
@@ -379,7 +382,7 @@ def make_vec(
         "same_step" are Gymnasium's, whose ``AutoresetMode`` may be given; with "disabled" only
         ``restart`` does.
       max_episode_steps: the time limit in steps; by default the task's.
-      engine: "auto", "native" (machine code) or "vmap".
+      engine: "auto", "native" (machine code), "vmap", or "mujoco" (C MuJoCo).
 
     Raises:
       ValueError: an argument makes no sense, the environment is none, or it does not fit in memory.

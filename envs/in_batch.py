@@ -1,0 +1,428 @@
+"""A task whose physics C MuJoCo computes, many episodes at once on all cores of the CPU.
+
+Observation, reward and end are traced and compiled as in ``base``; ``mujoco.batch.Batch`` computes
+what lies between them, as one operation of the compiled program. What MuJoCo carries from step to
+step (mjtState's mjSTATE_INTEGRATION) is carried in float64, also by a float32 program, so that an
+episode has C's own bits.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import logging
+import math
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from brax.envs.base import Env, State
+from mujoco.batch import DATA_FIELDS, Batch, SimulationError
+
+from mjx_reinforce.engine.base import MjModel, observation_size
+from mjx_reinforce.engine.contract import check_shape
+from mjx_reinforce.engine.cpu.host import HostCall, Spec
+from mjx_reinforce.engine.memory import gigabytes, host_memory, num_cores
+from mjx_reinforce.envs import models
+from mjx_reinforce.envs.outcomes import check_outcome
+from mjx_reinforce.envs.parts import Named
+from mjx_reinforce.envs.state import Before, Physics
+
+#: MuJoCo's own names; it is a C extension without stubs.
+_C: Any = mujoco
+_LOG = logging.getLogger(__name__)
+#: The field of ``Physics.carried`` with all of MuJoCo's state, in halves of float64.
+STATE = "mjtState"
+#: Warnings after which an episode is not what its model says: C has begun again, has taken zero for
+#: a control that is no number, or has left out contacts or constraints for which there was no room.
+_BROKEN = (
+    _C.mjtWarning.mjWARN_BADQPOS,
+    _C.mjtWarning.mjWARN_BADQVEL,
+    _C.mjtWarning.mjWARN_BADQACC,
+    _C.mjtWarning.mjWARN_BADCTRL,
+    _C.mjtWarning.mjWARN_CONTACTFULL,
+    _C.mjtWarning.mjWARN_CNSTRFULL,
+)
+#: Fields that C keeps sparse, where MJX and Gymnasium's documentation have a matrix.
+_SPARSE = ("M", "actuator_moment", "flexedge_J", "qLD", "ten_J")
+#: Simulations of models that need an MjData each keep it for this many sizes of a batch.
+_KEPT_BATCHES = 3
+
+
+def shape_of(data: Any, name: str) -> tuple[int, ...]:
+    """Returns the shape in which a task reads a field of mjData: rotations are [n, 3, 3].
+
+    Args:
+      data: an ``MjData``.
+      name: of the field.
+
+    Raises:
+      ValueError: C MuJoCo has no such field of a fixed size.
+    """
+    if name in _SPARSE:
+        raise ValueError(f"the task reads {name}, which C MuJoCo keeps as a sparse matrix")
+    if name not in DATA_FIELDS:
+        raise ValueError(f"the task reads {name}, which is not an array of mjData of a fixed size")
+    shape = np.shape(getattr(data, name))
+    return (shape[0], 3, 3) if name.endswith("mat") and shape[1:] == (9,) else shape
+
+
+class FieldRecorder(Named):
+    """An mjData of zeros that remembers which of its fields were read."""
+
+    def __init__(self, data: Any, mj_model: MjModel):
+        self.mj_model = mj_model
+        self.episode = {}
+        self.data = data
+        self.names: set[str] = set()
+
+    def __getattr__(self, name: str) -> jax.Array:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        spec = spec_of(self.data, name)
+        self.names.add(name)
+        return jnp.zeros(spec.shape, spec.dtype)
+
+
+def spec_of(data: Any, name: str) -> Spec:
+    """Returns the shape and dtype in which a task reads a field of mjData: JAX's own of its kind.
+
+    Raises:
+      ValueError: C MuJoCo has no such field of a fixed size.
+    """
+    shape = shape_of(data, name)
+    integers = np.issubdtype(np.asarray(getattr(data, name)).dtype, np.integer)
+    return Spec(shape, jnp.result_type(int if integers else float))
+
+
+class Simulations:
+    """Batches of simulations of one model, one for each number of episodes that play at once."""
+
+    def __init__(self, model: MjModel, fields: Sequence[str], randomized: Sequence[str]):
+        """Simulates nothing yet.
+
+        Args:
+          model: the model.
+          fields: of mjData, which a call returns.
+          randomized: fields of the model that differ from episode to episode.
+        """
+        self.model = model
+        self.fields = tuple(fields)
+        self.randomized = tuple(randomized)
+        self.data = _C.MjData(model)
+        self.num_threads = num_cores()
+        self._batches: dict[int, Batch] = {}
+        #: A batch is used by one thread at a time; XLA may make several calls at once.
+        self._lock = threading.Lock()
+
+    @property
+    def state_size(self) -> int:
+        """The numbers of mjtState that MuJoCo carries from step to step."""
+        return _C.mj_stateSize(self.model, _C.mjtState.mjSTATE_INTEGRATION)
+
+    def start(self, inputs: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
+        """Begins episodes: a forward pass at given positions and velocities.
+
+        Args:
+          inputs: qpos [B, nq], qvel [B, nv], the randomized fields of the model [B, ...].
+          results: state [B, S], sound [B] and the fields [B, ...], which are written.
+        """
+        qpos, qvel, *model_fields = inputs
+        with self._lock:
+            batch = self._batch(len(qpos))
+            # Clears what an episode before has left: activations, warm starts, delays, warnings.
+            batch.reset(stage=_C.mjtStage.mjSTAGE_NONE)
+            warnings = self._warnings(batch)
+            self._set_model(batch, model_fields, np.arange(batch.nsim))
+            batch.bind("qpos")[:] = qpos
+            batch.bind("qvel")[:] = qvel
+            failed = self._failed(batch, batch.forward)
+            self._write(batch, failed | (self._warnings(batch) > warnings), results)
+
+    def step(
+        self, num_steps: int, inputs: Sequence[np.ndarray], results: Sequence[np.ndarray]
+    ) -> None:
+        """Advances the episodes that run by some physics steps.
+
+        Args:
+          num_steps: physics steps, under the same control.
+          inputs: state [B, S], control [B, nu], running [B], the randomized fields of the model.
+          results: as of ``start``; those of an episode that does not run have no meaning.
+        """
+        state, control, running, *model_fields = inputs
+        ids = np.flatnonzero(running)
+        with self._lock:
+            batch = self._batch(len(state))
+            # The rows say all that there is of a simulation: it may have been another before.
+            batch.state[:] = state.view(np.float64)
+            batch.bind("ctrl")[:] = control
+            warnings = self._warnings(batch)
+            self._set_model(batch, model_fields, ids)
+            failed = np.zeros(batch.nsim, bool)
+            if ids.size:
+                failed = self._failed(
+                    batch, functools.partial(batch.step, ids=ids, nstep=num_steps)
+                )
+            self._write(batch, failed | (self._warnings(batch) > warnings), results)
+
+    def _batch(self, num_episodes: int) -> Batch:
+        """Returns the batch of so many simulations."""
+        if num_episodes not in self._batches:
+            # The oldest goes. Training, evaluation and test each play a number of episodes.
+            while len(self._batches) >= _KEPT_BATCHES:
+                del self._batches[next(iter(self._batches))]
+            self._check_memory(num_episodes)
+            batch = Batch(
+                self.model,
+                num_episodes,
+                nthread=min(self.num_threads, num_episodes),
+                persistent=self._needs_own_data(),
+            )
+            # Before the first call: a field that is bound later is zero until the next.
+            for name in self.fields:
+                batch.bind(name)
+            self._batches[num_episodes] = batch
+        return self._batches[num_episodes]
+
+    def _needs_own_data(self) -> bool:
+        """Returns whether a simulation has something that its state does not say."""
+        sleeps = self.model.opt.enableflags & _C.mjtEnableBit.mjENBL_SLEEP
+        return bool(sleeps) or self.model.nplugin > 0
+
+    def _check_memory(self, num_episodes: int) -> None:
+        """Raises ValueError where the arenas of so many simulations fit in no memory."""
+        count = num_episodes if self._needs_own_data() else min(self.num_threads, num_episodes)
+        num_bytes = count * (self.data.narena + self.data.nbuffer)
+        available = host_memory()
+        if num_bytes > available:
+            raise ValueError(
+                f"{num_episodes:,} simulations need {gigabytes(num_bytes)}, and there are "
+                f"{gigabytes(available)}; play fewer episodes at once, or give the model a smaller "
+                '<size memory="..."/>'
+            )
+
+    def _set_model(self, batch: Batch, model_fields: Sequence[np.ndarray], ids: np.ndarray) -> None:
+        """Gives simulations fields of the model of their own, and what follows from them."""
+        changed = np.zeros(batch.nsim, bool)
+        for name, values in zip(self.randomized, model_fields, strict=True):
+            field = batch.expand(name)
+            episode_values = values.reshape(field.shape).astype(field.dtype)
+            differs = field[ids] != episode_values[ids]
+            changed[ids] |= differs.reshape(len(ids), -1).any(1)
+            field[ids] = episode_values[ids]
+        # It takes as long as a few steps, and an episode's model stays what it was when it began.
+        if changed.any():
+            batch.set_const(ids=np.flatnonzero(changed))
+
+    def _failed(self, batch: Batch, compute: Callable[[], None]) -> np.ndarray:
+        """Computes, and returns of which simulations MuJoCo gave up [B], as in a full arena."""
+        try:
+            compute()
+        except SimulationError as error:
+            _LOG.warning("an episode ends as broken: %s", error)
+        return np.asarray(batch.status) != 0
+
+    def _warnings(self, batch: Batch) -> np.ndarray:
+        """Returns how often each simulation has been warned of what breaks it [B]."""
+        return batch.warning[:, [int(kind) for kind in _BROKEN], 1].sum(1)
+
+    def _write(self, batch: Batch, broken: np.ndarray, results: Sequence[np.ndarray]) -> None:
+        """Writes the state, whether it is sound, and the fields.
+
+        Args:
+          batch: the simulations.
+          broken: [B] which of them are not what the model says.
+          results: as of ``start``.
+        """
+        state, sound, *fields = results
+        state.view(np.float64)[:] = batch.state
+        sound[:] = ~broken
+        for name in ("qpos", "qvel"):
+            # C looks at these when the next step begins, MJX's engines look at once.
+            sound &= (np.abs(batch.bind(name)) <= _C.mjMAXVAL).all(1)
+        for name, field in zip(self.fields, fields, strict=True):
+            values = batch.bind(name).reshape(len(field), -1)
+            # A sensor that is ours alone, of ``models.with_contact_forces``, comes last.
+            field.reshape(len(field), -1)[:] = values[:, : math.prod(field.shape[1:])]
+
+
+class InBatch(Env):
+    """A ``MujocoEnv`` whose physics steps C MuJoCo computes, for any number of episodes at once.
+
+    Its ``reset`` and ``step`` are those of the task: pure functions, to be mapped by ``jax.vmap``.
+    """
+
+    def __init__(self, env: Any):
+        """Finds out which fields of mjData the task reads; simulates nothing.
+
+        Raises:
+          ValueError: the task reads what C MuJoCo has in no array of a fixed size.
+        """
+        self.env = env
+        self.max_episode_steps = env.max_episode_steps
+        self.reward_threshold = env.reward_threshold
+        self.action_space = env.action_space
+        model = (
+            models.with_contact_forces(env.settings.xml_file)
+            if env.contact_forces
+            else env.mj_model
+        )
+        self._data = _C.MjData(env.mj_model)
+        self._episode = jax.eval_shape(env.draw, jax.random.key(0))[0]
+        randomized = [name for name in models.RANDOM if name in self._episode]
+        fields = self._fields_read()
+        self._simulations = Simulations(model, fields, randomized)
+        self._start_call, self._step_call = self._host_calls(randomized)
+
+    def _fields_read(self) -> list[str]:
+        """Returns the fields of mjData that the task reads, and those that an env step hands on."""
+        recorder = FieldRecorder(self._data, self.env.mj_model)
+
+        def read(start_fields: dict[str, Any], episode: dict[str, Any], action: jax.Array) -> Any:
+            recorder.episode = episode
+            before = Before(start_fields, self.env.mj_model, episode)
+            return self.env.outcome(before, recorder, action), self.env.observe(recorder)
+
+        names = (*models.CARRIED, *models.CONSTANT, *self.env.carried)
+        specs = {name: self._spec(name) for name in names}
+        start_fields = {name: jnp.zeros(spec.shape, spec.dtype) for name, spec in specs.items()}
+        jax.eval_shape(read, start_fields, self._episode, jnp.zeros(self.env.action_size))
+        return sorted({*recorder.names, *models.CARRIED, *self.env.carried})
+
+    def _spec(self, name: str) -> Spec:
+        """Returns the shape and dtype in which a task reads a field of mjData."""
+        return spec_of(self._data, name)
+
+    def _host_calls(self, randomized: Sequence[str]) -> tuple[HostCall, HostCall]:
+        """Returns the operations that begin an episode and that advance one."""
+        model = self.env.mj_model
+        real = jnp.result_type(float)
+        simulations = self._simulations
+        state = Spec((2 * simulations.state_size,), np.uint32)
+        random = [Spec(self._episode[name].shape, self._episode[name].dtype) for name in randomized]
+        results = [state, Spec((), bool), *map(self._spec, simulations.fields)]
+        key = hashlib.sha256(models.digest(simulations.model).encode())
+        key.update(repr((simulations.fields, randomized, self.env.frame_skip, results)).encode())
+        step = _with_steps(simulations, self.env.frame_skip)
+        start_inputs = [Spec((model.nq,), real), Spec((model.nv,), real), *random]
+        step_inputs = [state, Spec((model.nu,), real), Spec((), bool), *random]
+        return (
+            HostCall(f"start_{key.hexdigest()}", simulations.start, start_inputs, results),
+            HostCall(f"step_{key.hexdigest()}", step, step_inputs, results),
+        )
+
+    def reset(self, rng: jax.Array) -> State:
+        """Returns the start of an episode; consumes the key."""
+        episode, (qpos, qvel) = self.env.draw(rng)
+        return self.set_state(qpos, qvel, episode)
+
+    def set_state(self, qpos: jax.Array, qvel: jax.Array, episode: dict[str, jax.Array]) -> State:
+        """Returns the state at positions [nq] and velocities [nv], as ``MujocoEnv.set_state``."""
+        real = jnp.result_type(float)
+        results = self._start_call(
+            jnp.asarray(qpos, real), jnp.asarray(qvel, real), *self._model_fields(episode)
+        )
+        physics, view, _ = self._simulated(results, episode)
+        zero = jnp.zeros((), real)
+        action = jnp.zeros(self.action_size, real)
+        terms = self._outcome(physics, view, action)[2]
+        metrics = dict.fromkeys(terms, zero)
+        return State(cast(Any, physics), self.env.observe(view), zero, zero, metrics)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Returns the state one env step later under ``action`` [A].
+
+        The reward is NaN where C MuJoCo has begun again, or has left something out.
+        """
+        return self._step(state, action, jnp.array(True))
+
+    def step_unfinished(self, state: State, action: jax.Array) -> State:
+        """Does as ``step``; what it returns of an episode that was over has no meaning."""
+        return self._step(state, action, (state.done == 0) & jnp.isfinite(state.reward))
+
+    def _step(self, state: State, action: jax.Array, running: jax.Array) -> State:
+        """Returns the state one env step later, of an episode that runs [] or is left as it is."""
+        check_shape("the action", action, (self.action_size,))
+        before = cast(Physics, state.pipeline_state)
+        control = jnp.asarray(action, jnp.result_type(float))
+        results = self._step_call(
+            before.carried[STATE], control, running, *self._model_fields(before.episode)
+        )
+        physics, view, sound = self._simulated(results, before.episode)
+        reward, terminated, terms = self._outcome(before, view, action)
+        dtype = state.reward.dtype
+        return dataclasses.replace(
+            state,
+            pipeline_state=physics,
+            obs=self.env.observe(view),
+            reward=jnp.where(sound, jnp.asarray(reward, dtype), jnp.nan),
+            done=jnp.asarray(terminated, dtype),
+            metrics=state.metrics | jax.tree.map(lambda x: jnp.asarray(x, dtype), terms),
+        )
+
+    def _model_fields(self, episode: dict[str, jax.Array]) -> list[jax.Array]:
+        """Returns the fields of the model that an episode has of its own."""
+        return [episode[name] for name in self._simulations.randomized]
+
+    def _simulated(
+        self, results: Sequence[jax.Array], episode: dict[str, jax.Array]
+    ) -> tuple[Physics, Any, jax.Array]:
+        """Returns what the next env step needs, what the task reads, and whether it is sound []."""
+        state, sound, *values = results
+        fields = dict(zip(self._simulations.fields, values, strict=True))
+        carried = {name: fields[name] for name in self.env.carried} | {STATE: state}
+        common = {name: fields[name] for name in models.CARRIED}
+        physics = Physics(**common, carried=carried, episode=episode)
+        return physics, Before(fields, self.env.mj_model, episode), sound
+
+    def _outcome(self, before: Physics, view: Any, action: jax.Array) -> Any:
+        """Returns what the task's ``outcome`` returns, checked."""
+        constant = {name: self._constant(name) for name in models.CONSTANT}
+        common = {name: getattr(before, name) for name in models.CARRIED}
+        start = Before(constant | before.carried | common, self.env.mj_model, before.episode)
+        return check_outcome(type(self.env).__name__, self.env.outcome(start, view, action))
+
+    def _constant(self, name: str) -> jax.Array:
+        """Returns a field that no step changes."""
+        value = np.asarray(getattr(self._data, name))
+        return jnp.asarray(value, self._spec(name).dtype)
+
+    @property
+    def mj_model(self) -> MjModel:
+        """The model."""
+        return self.env.mj_model
+
+    @property
+    def dt(self) -> float:
+        """The duration of one env step (s)."""
+        return self.env.dt
+
+    @property
+    def observation_size(self) -> int:
+        """The number O of entries of an observation."""
+        return observation_size(self)
+
+    @property
+    def action_size(self) -> int:
+        """The number A of entries of an action."""
+        return self.env.action_size
+
+    @property
+    def backend(self) -> str:
+        """The physics engine, for brax's interface."""
+        return "mujoco"
+
+    def __repr__(self) -> str:
+        return repr(self.env)
+
+
+def _with_steps(simulations: Simulations, num_steps: int) -> Callable[..., None]:
+    """Returns ``Simulations.step`` of so many physics steps."""
+
+    def step(inputs: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
+        simulations.step(num_steps, inputs, results)
+
+    return step
