@@ -10,7 +10,6 @@ import dataclasses
 import functools
 import hashlib
 import logging
-import math
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any, cast
@@ -48,6 +47,8 @@ _BROKEN = (
 )
 #: Fields that C keeps sparse, where MJX and Gymnasium's documentation have a matrix.
 _SPARSE = ("M", "actuator_moment", "flexedge_J", "qLD", "ten_J")
+#: What C computes after a step by ``mj_rnePostConstraint``, which ``mj_step`` does not call.
+_CONTACT_FORCES = ("cacc", "cfrc_ext", "cfrc_int")
 #: Simulations of models that need an MjData each keep it for this many sizes of a batch.
 _KEPT_BATCHES = 3
 
@@ -101,15 +102,24 @@ def spec_of(data: Any, name: str) -> Spec:
 class Simulations:
     """Batches of simulations of one model, one for each number of episodes that play at once."""
 
-    def __init__(self, model: MjModel, fields: Sequence[str], randomized: Sequence[str]):
+    def __init__(
+        self,
+        model: MjModel,
+        fields: Sequence[str],
+        randomized: Sequence[str],
+        *,
+        contact_forces: bool = False,
+    ):
         """Simulates nothing yet.
 
         Args:
           model: the model.
           fields: of mjData, which a call returns.
           randomized: fields of the model that differ from episode to episode.
+          contact_forces: whether ``step`` computes ``_CONTACT_FORCES`` as well.
         """
         self.model = model
+        self.contact_forces = contact_forces
         self.fields = tuple(fields)
         self.randomized = tuple(randomized)
         self.data = _C.MjData(model)
@@ -167,6 +177,8 @@ class Simulations:
                     batch, functools.partial(batch.step, ids=ids, nstep=num_steps)
                 )
             self._write(batch, failed | (self._warnings(batch) > warnings), results)
+            if self.contact_forces:
+                self._write_contact_forces(batch, ids, results)
 
     def _batch(self, num_episodes: int) -> Batch:
         """Returns the batch of so many simulations."""
@@ -190,7 +202,8 @@ class Simulations:
     def _needs_own_data(self) -> bool:
         """Returns whether a simulation has something that its state does not say."""
         sleeps = self.model.opt.enableflags & _C.mjtEnableBit.mjENBL_SLEEP
-        return bool(sleeps) or self.model.nplugin > 0
+        # Contact forces follow from all of mjData as the last step left it.
+        return bool(sleeps) or self.model.nplugin > 0 or self.contact_forces
 
     def _check_memory(self, num_episodes: int) -> None:
         """Raises ValueError where the arenas of so many simulations fit in no memory."""
@@ -244,9 +257,22 @@ class Simulations:
             # C looks at these when the next step begins, MJX's engines look at once.
             sound &= (np.abs(batch.bind(name)) <= _C.mjMAXVAL).all(1)
         for name, field in zip(self.fields, fields, strict=True):
-            values = batch.bind(name).reshape(len(field), -1)
-            # A sensor that is ours alone, of ``models.with_contact_forces``, comes last.
-            field.reshape(len(field), -1)[:] = values[:, : math.prod(field.shape[1:])]
+            field[:] = batch.bind(name).reshape(field.shape)
+
+    def _write_contact_forces(
+        self, batch: Batch, ids: np.ndarray, results: Sequence[np.ndarray]
+    ) -> None:
+        """Writes the contact forces of the simulations with these numbers; arguments as above."""
+        fields = dict(zip(self.fields, results[2:], strict=True))
+        names = [name for name in _CONTACT_FORCES if name in fields]
+        model = self.model
+        for number in ids:
+            if self.randomized:
+                model = batch.get_model(int(number))
+            batch.get_data(int(number), self.data)
+            _C.mj_rnePostConstraint(model, self.data)
+            for name in names:
+                fields[name][number] = getattr(self.data, name)
 
 
 class InBatch(Env):
@@ -265,16 +291,13 @@ class InBatch(Env):
         self.max_episode_steps = env.max_episode_steps
         self.reward_threshold = env.reward_threshold
         self.action_space = env.action_space
-        model = (
-            models.with_contact_forces(env.settings.xml_file)
-            if env.contact_forces
-            else env.mj_model
-        )
         self._data = _C.MjData(env.mj_model)
         self._episode = jax.eval_shape(env.draw, jax.random.key(0))[0]
         randomized = [name for name in models.RANDOM if name in self._episode]
         fields = self._fields_read()
-        self._simulations = Simulations(model, fields, randomized)
+        self._simulations = Simulations(
+            env.mj_model, fields, randomized, contact_forces=env.contact_forces
+        )
         self._start_call, self._step_call = self._host_calls(randomized)
 
     def _fields_read(self) -> list[str]:

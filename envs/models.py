@@ -77,26 +77,6 @@ def load_model(xml_file: ModelSource) -> Any:
     return model
 
 
-def with_contact_forces(xml_file: ModelSource) -> Any:
-    """Returns a model of which C MuJoCo computes ``cfrc_ext`` in every step.
-
-    C computes it for sensors alone, or when ``mj_rnePostConstraint`` is called. So the model gets a
-    sensor, after all others.
-
-    Raises:
-      ValueError: it is given as an ``MjModel``, to which no sensor can be added; or its integrator
-        is RK4, which computes sensors before the last of its four evaluations.
-    """
-    if isinstance(xml_file, MjModel):
-        raise ValueError("contact forces in C MuJoCo need the model's MJCF, not an MjModel")
-    extended = spec(xml_file)
-    body = _C.mjtObj.mjOBJ_BODY
-    if extended.option.integrator == _C.mjtIntegrator.mjINT_RK4:
-        raise ValueError("mujoco.batch has no contact forces at the end of a step of RK4")
-    extended.add_sensor(type=_C.mjtSensor.mjSENS_FRAMELINACC, objtype=body, objname="world")
-    return load_model(extended)
-
-
 def _name(xml_file: ModelSource) -> str:
     """Returns what a message calls a model: its file, the name that it has itself, or neither."""
     if isinstance(xml_file, MjSpec):

@@ -216,6 +216,43 @@ def test_random_masses_are_those_of_a_model_compiled_with_them(float64):
     np.testing.assert_array_equal(observations[:, 2], np.stack(expected))
 
 
+class FeltCart(Cart):
+    """It also observes the forces of contacts on its bodies."""
+
+    contact_forces = True
+
+    def observe(self, data):
+        return jnp.concatenate([super().observe(data), data.cfrc_ext.ravel()])
+
+
+class RandomFeltCart(FeltCart, RandomCart):
+    """Its masses differ from episode to episode, too."""
+
+
+@pytest.mark.parametrize(
+    ("integrator", "task"), [("Euler", FeltCart), ("RK4", FeltCart), ("Euler", RandomFeltCart)]
+)
+def test_contact_forces_are_those_of_the_last_evaluation(float64, integrator, task):
+    option = f'integrator="{integrator}"'
+    env = task(option=option)
+    keys, actions = jax.random.split(jax.random.key(6), 2), actions_of(env, 40, 2)
+    observations, rewards = stepped(env.in_c_mujoco(), keys, actions)
+    assert np.isfinite(rewards).all()
+    episodes, _ = jax.vmap(env.draw)(keys)
+    model = model_of(option=option)
+    model.body_mass[:] = episodes.get("body_mass", [model.body_mass] * 2)[1]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    alone = SteppedByC(model, observations[0, 1])
+    forces = [np.zeros((model.nbody, 6))]
+    for action in actions[:, 1]:
+        alone.step(action)
+        mujoco.mj_rnePostConstraint(model, alone.data)
+        forces.append(np.array(alone.data.cfrc_ext))
+    forces = np.reshape(forces, (len(forces), -1))
+    assert np.abs(forces).max() > 0.1
+    np.testing.assert_array_equal(observations[:, 1, -forces.shape[1] :], forces)
+
+
 @pytest.mark.parametrize("kind", ["an action that is no number", "a velocity beyond C's bound"])
 def test_what_c_mends_in_silence_breaks_the_episode_and_no_other(kind):
     env = Cart(**MODELS["elliptic"])
