@@ -6,12 +6,13 @@ step (mjtState's mjSTATE_INTEGRATION) is carried in float64, also by a float32 p
 episode has C's own bits.
 """
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, cast
 
 import jax
@@ -97,6 +98,23 @@ def spec_of(data: Any, name: str) -> Spec:
     shape = shape_of(data, name)
     integers = np.issubdtype(np.asarray(getattr(data, name)).dtype, np.integer)
     return Spec(shape, jnp.result_type(int if integers else float))
+
+
+@contextlib.contextmanager
+def _without_messages() -> Iterator[None]:
+    """Has MuJoCo print no warnings, and write none to MUJOCO_LOG.TXT in the user's folder.
+
+    What they warn of ends an episode as broken, which the trainer counts and shows.
+    """
+    config = _C.MjLogConfig.get()
+    silent_config = _C.MjLogConfig.get()
+    silent_config.logto_console = False
+    silent_config.logto_file = False
+    silent_config.set()
+    try:
+        yield
+    finally:
+        config.set()
 
 
 class Simulations:
@@ -233,7 +251,8 @@ class Simulations:
     def _failed(self, batch: Batch, compute: Callable[[], None]) -> np.ndarray:
         """Computes, and returns of which simulations MuJoCo gave up [B], as in a full arena."""
         try:
-            compute()
+            with _without_messages():
+                compute()
         except SimulationError as error:
             _LOG.warning("an episode ends as broken: %s", error)
         return np.asarray(batch.status) != 0

@@ -116,7 +116,13 @@ def make_plan(
         group_plans, division = _plan_sweep(design, saved_record)
         return Plan(design, group_plans, division, saved_record, None, None, clock)
     division = divide_run(config)
-    ready_programs = load_or_build_ready(config, design.default or config, env, division)
+    ready_programs = load_or_build_ready(
+        config,
+        design.default or config,
+        env,
+        division,
+        played_by=saved_record.get("played_by"),
+    )
     actors = None
     # The policies of a checkpoint began with those of the other run, and have learned since.
     if config.init_from is not None and checkpoint is None:
@@ -202,8 +208,15 @@ def _plan_sweep(
         chosen_names = vars(config).keys() & {*design.chosen_names, *design.over}
         unset_values = {name: None for name in chosen_names if is_read(name, config)}
         default: Any = dataclasses.replace(config, **unset_values)
+        played_by = None
+        if "played_by" in saved_record:
+            played_by = saved_record["played_by"][group_number]
         ready_programs = load_or_build_ready(
-            config, default, division=division, traced=tuple(group.settings)
+            config,
+            default,
+            division=division,
+            traced=tuple(group.settings),
+            played_by=played_by,
         )
         # A sweep that goes on has the chunks that it had, by whose names their files are found,
         # whatever memory there is here.

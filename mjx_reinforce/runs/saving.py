@@ -211,7 +211,8 @@ class RunFiles(Files[RunDriver]):
         """Writes config.json, and a metrics.csv that has no rows yet."""
         settings = dataclasses.asdict(config) | {"output": str(self._directory)}
         del settings["resume"]
-        self._write_json("config.json", settings | provenance())
+        played_by = {"played_by": self._plan.group_plans[0].ready.engine}
+        self._write_json("config.json", settings | played_by | provenance())
         write_bytes(self._metrics, HEADER)
 
     def _take_back(self, driver: RunDriver, checkpoint: Checkpoint | None) -> None:
@@ -330,6 +331,7 @@ class SweepFiles(Files[Driver]):
             "chunk_runs": [group_plan.limit for group_plan in group_plans],
             "local_devices": self._plan.division.count,
             "engine": group_plans[0].ready.engine,
+            "played_by": [group_plan.ready.engine for group_plan in group_plans],
             "compile_seconds": saved_record.get("compile_seconds", 0.0),
             "run_seconds": saved_record.get("run_seconds", 0.0),
             "command": saved_record.get("command", typed("sweep")),

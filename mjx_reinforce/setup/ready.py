@@ -60,6 +60,7 @@ def load_or_build_ready(
     env: Environment | None = None,
     division: Division = ALONE,
     traced: Collection[str] | None = None,
+    played_by: str | None = None,
 ) -> Ready:
     """Returns what the settings come to; those of a run from disk, if they did before.
 
@@ -69,6 +70,7 @@ def load_or_build_ready(
       env: the environment; by default the one that the settings name, built if it is needed.
       division: see ``build_ready``.
       traced: see ``build_ready``.
+      played_by: the engine that played before, where a run goes on.
 
     Raises:
       ValueError: the settings do not fit the environment.
@@ -83,8 +85,13 @@ def load_or_build_ready(
     if ready is None:
         task = envs.make_set(config.env, config.env_set) if env is None else env
         ready = build_ready(task, config, division, traced)
-        if key is not None:
+        # JAX exports no program that calls C MuJoCo, for it calls Python.
+        if key is not None and ready.engine != "mujoco":
             ready = save_ready(key, ready)
+    # ``auto`` may choose otherwise now: compiled programs have come to the disk, or have gone.
+    if played_by not in (None, ready.engine):
+        same_engine: Any = dataclasses.replace(config, engine=played_by)
+        return load_or_build_ready(same_engine, default, env, division, traced)
     if config.resume is None and config.policy == "auto":
         check_read_by_policy(config, default, ready.policy["policy"])
     return ready

@@ -41,7 +41,7 @@ _DECISIVE_ENTRIES = (
     "xla_flags",
 )
 #: Entries that no number depends on.
-_OTHER_ENTRIES = ("python", "num_devices", "cpu_count", "resumed")
+_OTHER_ENTRIES = ("python", "num_devices", "cpu_count", "resumed", "played_by")
 _DEVICES_FLAG = "--xla_force_host_platform_device_count"
 _DAMAGE = "damaged, or of another version of the program; resume with the version that wrote it"
 

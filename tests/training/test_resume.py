@@ -146,6 +146,18 @@ def test_a_full_disk_costs_no_training(run, trained, tmp_path, monkeypatch, caps
         assert f"warning: cannot write {what} (No space left on device)" in output
 
 
+def test_a_run_goes_on_with_the_engine_that_it_has(run, tmp_path):
+    """Also where ``auto`` would choose another one by now."""
+    assert run(*COMMON, "--max-updates", 2, "--output", "run") == 0
+    path = tmp_path / "run" / "config.json"
+    record = json.loads(path.read_text())
+    assert (record["engine"], record["played_by"]) == ("auto", "native")
+    path.write_text(json.dumps(record | {"played_by": "vmap"}))
+    assert run("--resume", "run", "--max-updates", 4) == 0
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["engine"] == "vmap"
+
+
 @pytest.mark.slow
 def test_a_run_that_cannot_end_is_resumed(run, trained, tmp_path, monkeypatch, capsys):
     def full(path, content, compressed):
