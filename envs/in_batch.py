@@ -140,7 +140,6 @@ class Simulations:
         self.contact_forces = contact_forces
         self.fields = tuple(fields)
         self.randomized = tuple(randomized)
-        self.data = _C.MjData(model)
         self.num_threads = num_cores()
         self._batches: dict[int, Batch] = {}
         #: A batch is used by one thread at a time; XLA may make several calls at once.
@@ -226,7 +225,7 @@ class Simulations:
     def _check_memory(self, num_episodes: int) -> None:
         """Raises ValueError where the arenas of so many simulations fit in no memory."""
         count = num_episodes if self._needs_own_data() else min(self.num_threads, num_episodes)
-        num_bytes = count * (self.data.narena + self.data.nbuffer)
+        num_bytes = count * (self.model.narena + _C.MjData(self.model).nbuffer)
         available = host_memory()
         if num_bytes > available:
             raise ValueError(
@@ -285,13 +284,14 @@ class Simulations:
         fields = dict(zip(self.fields, results[2:], strict=True))
         names = [name for name in _CONTACT_FORCES if name in fields]
         model = self.model
+        data = _C.MjData(model)
         for number in ids:
             if self.randomized:
                 model = batch.get_model(int(number))
-            batch.get_data(int(number), self.data)
-            _C.mj_rnePostConstraint(model, self.data)
+            batch.get_data(int(number), data)
+            _C.mj_rnePostConstraint(model, data)
             for name in names:
-                fields[name][number] = getattr(self.data, name)
+                fields[name][number] = getattr(data, name)
 
 
 class InBatch(Env):
@@ -310,18 +310,23 @@ class InBatch(Env):
         self.max_episode_steps = env.max_episode_steps
         self.reward_threshold = env.reward_threshold
         self.action_space = env.action_space
-        self._data = _C.MjData(env.mj_model)
+        # Not kept: of some models the arena alone has gigabytes.
+        data = _C.MjData(env.mj_model)
+        self._constants = {
+            name: np.array(getattr(data, name), spec_of(data, name).dtype)
+            for name in models.CONSTANT
+        }
         self._episode = jax.eval_shape(env.draw, jax.random.key(0))[0]
         randomized = [name for name in models.RANDOM if name in self._episode]
-        fields = self._fields_read()
+        fields = self._fields_read(data)
         self._simulations = Simulations(
             env.mj_model, fields, randomized, contact_forces=env.contact_forces
         )
-        self._start_call, self._step_call = self._host_calls(randomized)
+        self._start_call, self._step_call = self._host_calls(data, randomized)
 
-    def _fields_read(self) -> list[str]:
+    def _fields_read(self, data: Any) -> list[str]:
         """Returns the fields of mjData that the task reads, and those that an env step hands on."""
-        recorder = FieldRecorder(self._data, self.env.mj_model)
+        recorder = FieldRecorder(data, self.env.mj_model)
 
         def read(start_fields: dict[str, Any], episode: dict[str, Any], action: jax.Array) -> Any:
             recorder.episode = episode
@@ -329,23 +334,19 @@ class InBatch(Env):
             return self.env.outcome(before, recorder, action), self.env.observe(recorder)
 
         names = (*models.CARRIED, *models.CONSTANT, *self.env.carried)
-        specs = {name: self._spec(name) for name in names}
+        specs = {name: spec_of(data, name) for name in names}
         start_fields = {name: jnp.zeros(spec.shape, spec.dtype) for name, spec in specs.items()}
         jax.eval_shape(read, start_fields, self._episode, jnp.zeros(self.env.action_size))
         return sorted({*recorder.names, *models.CARRIED, *self.env.carried})
 
-    def _spec(self, name: str) -> Spec:
-        """Returns the shape and dtype in which a task reads a field of mjData."""
-        return spec_of(self._data, name)
-
-    def _host_calls(self, randomized: Sequence[str]) -> tuple[HostCall, HostCall]:
+    def _host_calls(self, data: Any, randomized: Sequence[str]) -> tuple[HostCall, HostCall]:
         """Returns the operations that begin an episode and that advance one."""
         model = self.env.mj_model
         real = jnp.result_type(float)
         simulations = self._simulations
         state = Spec((2 * simulations.state_size,), np.uint32)
         random = [Spec(self._episode[name].shape, self._episode[name].dtype) for name in randomized]
-        results = [state, Spec((), bool), *map(self._spec, simulations.fields)]
+        results = [state, Spec((), bool), *(spec_of(data, name) for name in simulations.fields)]
         key = hashlib.sha256(models.digest(simulations.model).encode())
         key.update(repr((simulations.fields, randomized, self.env.frame_skip, results)).encode())
         step = _with_steps(simulations, self.env.frame_skip)
@@ -422,15 +423,10 @@ class InBatch(Env):
 
     def _outcome(self, before: Physics, view: Any, action: jax.Array) -> Any:
         """Returns what the task's ``outcome`` returns, checked."""
-        constant = {name: self._constant(name) for name in models.CONSTANT}
+        constant = {name: jnp.asarray(value) for name, value in self._constants.items()}
         common = {name: getattr(before, name) for name in models.CARRIED}
         start = Before(constant | before.carried | common, self.env.mj_model, before.episode)
         return check_outcome(type(self.env).__name__, self.env.outcome(start, view, action))
-
-    def _constant(self, name: str) -> jax.Array:
-        """Returns a field that no step changes."""
-        value = np.asarray(getattr(self._data, name))
-        return jnp.asarray(value, self._spec(name).dtype)
 
     @property
     def mj_model(self) -> MjModel:

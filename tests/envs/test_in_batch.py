@@ -1,5 +1,7 @@
 """Tasks whose physics C MuJoCo computes, many at once, beside one MjData stepped by itself."""
 
+import resource
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -289,6 +291,20 @@ def test_a_full_arena_breaks_the_episode():
         state = jax.vmap(task.step)(state, jnp.zeros((2, env.action_size)))
         rewards.append(np.asarray(state.reward))
     assert np.isnan(rewards).any()
+
+
+def address_space():
+    """Returns how many bytes this process has reserved."""
+    num_pages = int(Path("/proc/self/statm").read_text().split()[0])
+    return num_pages * resource.getpagesize()
+
+
+def test_no_arena_is_reserved_before_an_episode():
+    """Of a model for whole scenes it may have gigabytes, of which an episode touches little."""
+    env = Cart(size='<size memory="4G"/>', **MODELS["elliptic"])
+    reserved = address_space()
+    env.in_c_mujoco()
+    assert address_space() - reserved < 2 * 2**30
 
 
 def test_auto_takes_c_mujoco_where_nothing_else_is_faster():
