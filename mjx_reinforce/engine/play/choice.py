@@ -85,10 +85,13 @@ def choose(
     """
     start_time = time.perf_counter()
     check_name("engine", name, dict.fromkeys(ENGINES))
+
+    def engine_in_c(task: Environment, reason: str) -> Engine:
+        return Engine("mujoco", reason, _rollout_in_c(task), time.perf_counter() - start_time)
+
     in_c = _in_c_mujoco(name, env)
     if in_c is not None:
-        task, reason = in_c
-        return Engine("mujoco", reason, _rollout_in_c(task), time.perf_counter() - start_time)
+        return engine_in_c(*in_c)
 
     def in_machine_code() -> Rollout | str:
         if policy is None or horizon is None:
@@ -99,6 +102,10 @@ def choose(
         return native.unsupported(env, *policy, horizon) or native_rollout
 
     engine_name, reason, rollout = pick(name, in_machine_code, rollouts.vmap_rollout)
+    if engine_name == "vmap" and name == "auto" and policy is not None:
+        in_c = instead_of_vmap(env, reason)
+        if in_c is not None:
+            return engine_in_c(*in_c)
     if engine_name == "native" and available.platform() == "gpu":
         reason += f", {team.played_by(env)}"
     return Engine(engine_name, reason, rollout, time.perf_counter() - start_time)
@@ -128,6 +135,20 @@ def _in_c_mujoco(name: str, env: Environment) -> tuple[Environment, str] | None:
     if name == "mujoco":
         reason = "chosen by name"
     return task, c_mujoco.in_words(str(reason))
+
+
+def instead_of_vmap(env: Environment, reason: str) -> tuple[Environment, str] | None:
+    """Returns what C MuJoCo plays where machine code cannot hold an env step, and the reason.
+
+    On a CPU, XLA then compiles for minutes, and plays such a model slower than C MuJoCo
+    (docs/decisions.md). None on other devices, and where there is no machine code for anything.
+    """
+    if available.platform() != "cpu" or available.unavailable():
+        return None
+    task = c_mujoco.played_by_c(env)
+    if isinstance(task, str):
+        return None
+    return task, c_mujoco.in_words(reason)
 
 
 def _rollout_in_c(task: Any) -> Rollout:

@@ -30,7 +30,12 @@ from mjx_reinforce.engine.checks import check_count, check_key, check_name, chec
 from mjx_reinforce.engine.contract import check_environment, check_shape
 from mjx_reinforce.engine.memory import gigabytes, host_memory
 from mjx_reinforce.engine.play.available import GENERATOR
-from mjx_reinforce.engine.play.choice import MapEngine, environment_of, map_function
+from mjx_reinforce.engine.play.choice import (
+    MapEngine,
+    environment_of,
+    instead_of_vmap,
+    map_function,
+)
 from mjx_reinforce.engine.play.counter import key_of_words
 
 #: When an environment whose episode has ended begins the next (Gymnasium's ``AutoresetMode``).
@@ -220,24 +225,35 @@ class VectorEnv:
         self.autoreset = autoreset
         self.max_episode_steps = max_episode_steps
         self.action_space: Box | Discrete = action_space(env)
-        task, reason_for_c = environment_of(engine, env)
-        self._blank = blank(task)
         # What is continuous is in JAX's precision, float64 where ``jax_enable_x64`` is set.
         zeros = null_action(env)
         dtype = jnp.result_type(float) if zeros.ndim else zeros.dtype
         self._null_action = np.asarray(zeros, dtype)
-        self.observation_size = int(self._blank.final_obs.shape[0])
         self.action_size = env.action_size
+        self.engine = self._engine(engine, *environment_of(engine, env))
+        if engine == "auto" and self.engine.name == "vmap":
+            in_c = instead_of_vmap(env, self.engine.why)
+            if in_c is not None:
+                self.engine = self._engine(engine, *in_c)
+        self._call = jax.jit(self.engine.call)
+
+    def _engine(self, name: str, task: Environment, reason_for_c: str | None) -> MapEngine:
+        """Returns what steps the environments, and takes their structure from the task.
+
+        Args:
+          name: of the engine.
+          task: what the environments are.
+          reason_for_c: why C MuJoCo computes the task's physics; None if it does not.
+        """
+        self._blank = blank(task)
+        self.observation_size = int(self._blank.final_obs.shape[0])
         # Before the step is compiled, which takes seconds to minutes.
         self._check_memory()
-        advance = advance_function(task, max_episode_steps, autoreset)
+        advance = advance_function(task, self.max_episode_steps, self.autoreset)
+        if reason_for_c is not None:
+            return MapEngine("mujoco", reason_for_c, jax.vmap(advance))
         flag = jax.ShapeDtypeStruct((), bool)
-        self.engine: MapEngine
-        if reason_for_c is None:
-            self.engine = map_function(engine, task, advance, self._blank, self._null_action, flag)
-        else:
-            self.engine = MapEngine("mujoco", reason_for_c, jax.vmap(advance))
-        self._call = jax.jit(self.engine.call)
+        return map_function(name, task, advance, self._blank, self._null_action, flag)
 
     def reset(self, key: jax.Array) -> VectorState:
         """Returns N environments at the start of their first episodes.
