@@ -167,7 +167,7 @@ def _moments(model: MjModel, data: Any, actuators: np.ndarray) -> np.ndarray:
 def _centers(pose: _Pose, fields: Fields) -> jax.Array:
     """Returns the Jacobian of the centers of mass, [nbody, 3, nv]."""
     arms = jnp.einsum("bxk,bk->bx", pose.xmat, fields["body_ipos"])
-    return pose.origins + jnp.cross(pose.turns, arms[:, :, None], axis=1)
+    return jnp.cross(pose.turns, arms[:, :, None], axis=1) + pose.origins
 
 
 def _matrix(model: MjModel, pose: _Pose, centers: jax.Array, fields: Fields) -> jax.Array:
