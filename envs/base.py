@@ -24,7 +24,7 @@ from mjx_reinforce.engine.physics import mjx_internals, sensors
 from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
 from mjx_reinforce.engine.scalar import prune, whole
-from mjx_reinforce.envs import in_batch, models, refusals
+from mjx_reinforce.envs import derived, in_batch, models, refusals
 from mjx_reinforce.envs.outcomes import check_centers, check_episode, check_outcome, check_start
 from mjx_reinforce.envs.parts import View
 from mjx_reinforce.envs.settings import EpisodeSettings, build_settings
@@ -140,12 +140,12 @@ class MujocoEnv(Env):
           Numbers and arrays by name, such as a goal or a command, which ``outcome`` and ``observe``
           read as ``data.episode["goal"]``. Those with a name of ``models.RANDOM``, such as
           ``geom_friction`` [ngeom, 3] or ``body_mass`` [nbody], take the place of that field of
-          the model in this episode. What MuJoCo computes from a field when it compiles a model
-          stays that of the model, but for ``body_subtreemass``: ``body_invweight0``,
-          ``dof_invweight0`` and ``tendon_invweight0``, which say how soft contacts and limits are,
-          ``actuator_acc0``, by which muscles scale, and ``actuator_length0``. With masses twice as
-          large, contacts placed a landing body 7 mm from where the model compiled with these masses
-          has it. ``body_ipos`` of a free body needs ``<body simple="false">``.
+          the model in this episode. What MuJoCo derives from them follows in every engine, as by
+          ``mj_setConst``: how soft contacts, limits, friction losses and equalities are, by what
+          muscles scale, and where cameras follow (``derived.constants``). As there, a servo with
+          dampratio keeps the damping of the compiled model, and a muscle keeps its
+          ``actuator_lengthrange``. To move the center of mass (``body_ipos``) of a body whose frame
+          is there, write ``<body simple="false">``; else this raises ``UnsupportedError``.
         """
         return {}
 
@@ -232,13 +232,20 @@ class MujocoEnv(Env):
         """Why nothing simulates this model faster than C MuJoCo, in a few words; None if else."""
         return refusals.best_in_c(self.mj_model)
 
-    def _physics_of(self, episode: dict[str, jax.Array]) -> tuple[Any, Any]:
+    def _model_of(
+        self, episode: dict[str, jax.Array], constants: dict[str, jax.Array]
+    ) -> mjx.Model:
+        """Returns the model as it is in an episode: drawn fields, and constants that follow."""
+        return self.model.replace(**models.replaced(episode), **constants)
+
+    def _physics_of(
+        self, episode: dict[str, jax.Array], constants: dict[str, jax.Array]
+    ) -> tuple[Any, Any]:
         """Returns the forward pass and the step of the model as it is in an episode."""
-        model_fields = models.replaced(self.mj_model, episode)
-        if not model_fields:
+        if not models.replaced(episode):
             return self._forward, self._physics_step
         # Not jitted: they close over this episode's fields, so no trace could be used again.
-        model = self.model.replace(**model_fields)
+        model = self._model_of(episode, constants)
         forward = functools.partial(_forward, model)
         return forward, _step_of(model, forward)
 
@@ -247,13 +254,14 @@ class MujocoEnv(Env):
     ) -> State:
         """Returns the state at positions and velocities, from one forward pass."""
         start_data = models.make_data(self.mj_model).replace(qpos=qpos, qvel=qvel)
+        constants = derived.constants(self.mj_model, episode)
         # MJX normalizes quaternions in qpos itself; MuJoCo does so when it steps.
         if self._stays_whole(episode):
             data, _ = self._whole("start", start_data)
         else:
-            forward, _ = self._physics_of(episode)
+            forward, _ = self._physics_of(episode, constants)
             data = physics.like(forward(start_data).replace(qpos=qpos), start_data)
-        state = self._physics(data, episode)
+        state = self._physics(data, episode, constants)
         view = View(data, self.mj_model, episode)
         # No env step was made: the outcome says only which terms there are, each 0 so far. Wrappers
         # and loops need a state of one structure from the first step on.
@@ -273,7 +281,7 @@ class MujocoEnv(Env):
         before = cast(Any, state.pipeline_state)
         # All else in mjData follows from what is carried, or stays as the model has it.
         start_data = models.make_data(self.mj_model).replace(**_carried(before))
-        _, physics_step = self._physics_of(before.episode)
+        _, physics_step = self._physics_of(before.episode, before.constants)
 
         def advance(_: int, carry: tuple[mjx.Data, jax.Array]) -> tuple[mjx.Data, jax.Array]:
             """One physics step; sound until the first that C MuJoCo would not have made."""
@@ -289,14 +297,14 @@ class MujocoEnv(Env):
             data, is_sound = jax.lax.fori_loop(0, self.frame_skip, advance, start_of_loop)
             # Once an env step, as Gymnasium's ``do_simulation`` calls it after the last mj_step.
             if self.contact_forces:
-                model = self.model.replace(**models.replaced(self.mj_model, before.episode))
+                model = self._model_of(before.episode, before.constants)
                 data = sensors.rne_postconstraint(model, data)
         view = View(data, self.mj_model, before.episode)
         reward, terminated, terms = self._outcome(before, start_data, view, action)
         dtype = state.reward.dtype
         return dataclasses.replace(
             state,
-            pipeline_state=self._physics(data, before.episode),
+            pipeline_state=self._physics(data, before.episode, before.constants),
             obs=self.observe(view),
             reward=jnp.where(is_sound, jnp.asarray(reward, dtype), jnp.nan),
             done=jnp.asarray(terminated, dtype),
@@ -315,7 +323,7 @@ class MujocoEnv(Env):
 
     def _stays_whole(self, episode: dict[str, jax.Array]) -> bool:
         """Returns whether the physics is to stay one operation, which device code computes."""
-        return is_kept_whole() and not models.replaced(self.mj_model, episode)
+        return is_kept_whole() and not models.replaced(episode)
 
     def _whole(self, name: str, start: mjx.Data) -> tuple[mjx.Data, jax.Array]:
         """Returns what an operation of the device code makes of a simulation; whether it is sound.
@@ -342,11 +350,15 @@ class MujocoEnv(Env):
         before = Before(state_fields, self.mj_model, state.episode)
         return check_outcome(type(self).__name__, self.outcome(before, data, action))
 
-    def _physics(self, data: mjx.Data, episode: dict[str, jax.Array]) -> Physics:
+    def _physics(
+        self, data: mjx.Data, episode: dict[str, jax.Array], constants: dict[str, jax.Array]
+    ) -> Physics:
         """Returns what the next env step needs to know of a simulation."""
         # ``Simulation`` has MuJoCo's names, wherever MJX keeps the fields.
         carried_fields = {name: getattr(Simulation(data), name) for name in self.carried}
-        return Physics(**_carried(data), carried=carried_fields, episode=episode)
+        return Physics(
+            **_carried(data), carried=carried_fields, episode=episode, constants=constants
+        )
 
     @property
     def dt(self) -> float:

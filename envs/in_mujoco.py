@@ -67,12 +67,12 @@ class InMujoco:
         self._episode, (qpos, qvel) = self._start(rng)
         # A copy, since an episode may replace fields of the model.
         self.model = model = copy.copy(self.env.mj_model)
-        for name, value in models.replaced(model, self._episode).items():
-            getattr(model, name)[:] = value
-        if "body_ipos" in self._episode:  # C would take the places of frames that were the same
-            for frame_types in (model.body_sameframe, model.geom_sameframe, model.site_sameframe):
-                frame_types[:] = int(_C.mjtSameFrame.mjSAMEFRAME_NONE)
         data = _C.MjData(model)
+        if model_fields := models.replaced(self._episode):
+            for name, field in model_fields.items():
+                getattr(model, name)[:] = field
+            _C.mj_setConst(model, data)
+            _C.mj_resetData(model, data)
         data.qpos[:] = qpos
         data.qvel[:] = qvel
         _C.mj_forward(model, data)

@@ -135,24 +135,13 @@ def digest(model: MjModel) -> str:
     return hashlib.sha256(data.tobytes()).hexdigest()
 
 
-def replaced(model: Any, episode: dict[str, Any]) -> dict[str, Any]:
+def replaced(episode: dict[str, Any]) -> dict[str, Any]:
     """Returns the fields of a model that an episode replaces, see ``MujocoEnv.randomize``.
 
-    The masses of subtrees follow from those of bodies.
-
     Args:
-      model: an ``MjModel`` or an ``mjx.Model``.
       episode: what ``MujocoEnv.randomize`` returned.
     """
-    model_fields = {name: value for name, value in episode.items() if name in RANDOM}
-    if "body_mass" in model_fields:
-        in_subtree = np.eye(model.nbody)  # [i, j]: whether body j is in the subtree of body i
-        # From the leaves to the root: a parent's number is below those of its children.
-        for body in range(model.nbody - 1, 0, -1):
-            in_subtree[model.body_parentid[body]] += in_subtree[body]
-        mass = model_fields["body_mass"]
-        model_fields["body_subtreemass"] = in_subtree.astype(mass.dtype) @ mass
-    return model_fields
+    return {name: value for name, value in episode.items() if name in RANDOM}
 
 
 def make_data(model: "mjx.Model") -> mjx.Data:

@@ -78,8 +78,8 @@ def check_centers(
 ) -> None:
     """Checks that ``randomize`` moves no center of mass that MuJoCo compiled to be a body's origin.
 
-    The inertia matrix then has no entries in which the moved center would show. The bodies that it
-    moves are those of a few draws.
+    The inertia matrix then has no entries in which the moved center would show; ``mj_setConst``
+    refuses it, too. The bodies that it moves are those of a few draws.
 
     Args:
       name: of the task.
@@ -95,9 +95,10 @@ def check_centers(
         keys = jax.random.split(jax.random.key(0), _DRAWS)
         draws = np.asarray(jax.vmap(lambda key: jnp.asarray(randomize(key)["body_ipos"]))(keys))
     has_moved = np.any(draws != np.asarray(center), axis=(0, 2))
-    # body_simple is 1 where MuJoCo takes the body's block of the inertia matrix to be diagonal. The
-    # block of one degree of freedom is a single number, which has its place.
-    fixed_bodies = np.flatnonzero(has_moved & (model.body_simple == 1) & (model.body_dofnum > 1))
+    # body_simple is not 0 where MuJoCo takes the body's block of the inertia matrix to be diagonal,
+    # also of one degree of freedom or none. The world has no mass.
+    has_moved[0] = False
+    fixed_bodies = np.flatnonzero(has_moved & (model.body_simple != 0))
     if fixed_bodies.size:
         bodies = ", ".join(model.body(int(body)).name or f"number {body}" for body in fixed_bodies)
         raise UnsupportedError(

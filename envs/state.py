@@ -21,6 +21,7 @@ class Physics:
     qacc_warmstart: [nv] where the constraint solver starts (m/s^2, rad/s^2)
     carried: fields of the last step's mjx.Data that the next outcome reads, by their names
     episode: what ``MujocoEnv.randomize`` returned
+    constants: fields of the model that follow from it, see ``derived.constants``
     """
 
     time: jax.Array
@@ -30,6 +31,7 @@ class Physics:
     qacc_warmstart: jax.Array
     carried: dict[str, jax.Array] = struct.field(default_factory=dict)
     episode: dict[str, jax.Array] = struct.field(default_factory=dict)
+    constants: dict[str, jax.Array] = struct.field(default_factory=dict)
 
 
 class Before(Named, Simulation):
