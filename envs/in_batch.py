@@ -24,11 +24,12 @@ from mujoco.batch import DATA_FIELDS, Batch, SimulationError
 
 from mjx_reinforce.engine.base import MjModel, observation_size
 from mjx_reinforce.engine.contract import check_shape
-from mjx_reinforce.engine.cpu.host import HostCall, Spec
+from mjx_reinforce.engine.cpu.host import HostCall, HostFunction, Spec
 from mjx_reinforce.engine.memory import gigabytes, host_memory, num_cores
 from mjx_reinforce.envs import models
-from mjx_reinforce.envs.outcomes import check_outcome
+from mjx_reinforce.envs.outcomes import check_control, check_outcome
 from mjx_reinforce.envs.parts import Named
+from mjx_reinforce.envs.starts import MOCAP
 from mjx_reinforce.envs.state import Before, Physics
 
 #: MuJoCo's own names; it is a C extension without stubs.
@@ -123,22 +124,26 @@ class Simulations:
         """The numbers of mjtState that MuJoCo carries from step to step."""
         return _C.mj_stateSize(self.model, _C.mjtState.mjSTATE_INTEGRATION)
 
-    def start(self, inputs: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
-        """Begins episodes: a forward pass at given positions and velocities.
+    def start(
+        self, names: Sequence[str], inputs: Sequence[np.ndarray], results: Sequence[np.ndarray]
+    ) -> None:
+        """Begins episodes: a forward pass at given positions, velocities and other fields.
 
         Args:
-          inputs: qpos [B, nq], qvel [B, nv], the randomized fields of the model [B, ...].
+          names: of the fields that are not as the model has them.
+          inputs: those fields [B, ...], the randomized fields of the model [B, ...].
           results: state [B, S], sound [B] and the fields [B, ...], which are written.
         """
-        qpos, qvel, *model_fields = inputs
+        start_fields = inputs[: len(names)]
+        model_fields = inputs[len(names) :]
         with self._lock:
-            batch = self._batch(len(qpos))
+            batch = self._batch(len(start_fields[0]))
             # Clears what an episode before has left: activations, warm starts, delays, warnings.
             batch.reset(stage=_C.mjtStage.mjSTAGE_NONE)
             warnings = self._warnings(batch)
             self._set_model(batch, model_fields, np.arange(batch.nsim))
-            batch.bind("qpos")[:] = qpos
-            batch.bind("qvel")[:] = qvel
+            for name, values in zip(names, start_fields, strict=True):
+                batch.bind(name)[:] = values
             failed = self._failed(batch, batch.forward)
             self._write(batch, failed | (self._warnings(batch) > warnings), results)
 
@@ -271,11 +276,16 @@ class InBatch(Env):
             else env.mj_model
         )
         self._data = _C.MjData(env.mj_model)
+        # Those of mocap bodies are not always as the model has them.
+        self._carried = env.carried
+        if env.mj_model.nmocap:
+            self._carried = (*env.carried, *MOCAP)
         self._episode = jax.eval_shape(env.draw, jax.random.key(0))[0]
         randomized = [name for name in models.RANDOM if name in self._episode]
         fields = self._fields_read()
         self._simulations = Simulations(model, fields, randomized)
-        self._start_call, self._step_call = self._host_calls(randomized)
+        self._digest = models.digest(model)
+        self._step_call = self._host_step()
 
     def _fields_read(self) -> list[str]:
         """Returns the fields of mjData that the task reads, and those that an env step hands on."""
@@ -286,45 +296,72 @@ class InBatch(Env):
             before = Before(start_fields, self.env.mj_model, episode)
             return self.env.outcome(before, recorder, action), self.env.observe(recorder)
 
-        names = (*models.CARRIED, *models.CONSTANT, *self.env.carried)
+        names = (*models.CARRIED, *models.CONSTANT, *self._carried)
         specs = {name: self._spec(name) for name in names}
         start_fields = {name: jnp.zeros(spec.shape, spec.dtype) for name, spec in specs.items()}
         jax.eval_shape(read, start_fields, self._episode, jnp.zeros(self.env.action_size))
-        return sorted({*recorder.names, *models.CARRIED, *self.env.carried})
+        return sorted({*recorder.names, *models.CARRIED, *self._carried})
 
     def _spec(self, name: str) -> Spec:
         """Returns the shape and dtype in which a task reads a field of mjData."""
         return spec_of(self._data, name)
 
-    def _host_calls(self, randomized: Sequence[str]) -> tuple[HostCall, HostCall]:
-        """Returns the operations that begin an episode and that advance one."""
-        model = self.env.mj_model
-        real = jnp.result_type(float)
+    def _host_start(self, names: tuple[str, ...]) -> HostCall:
+        """Returns the operation that begins an episode, given fields of mjData by their names."""
+        start = functools.partial(self._simulations.start, names)
+        inputs = [*map(self._spec, names)]
+        return self._host_call("start", names, start, inputs)
+
+    def _host_step(self) -> HostCall:
+        """Returns the operation that advances an episode."""
         simulations = self._simulations
-        state = Spec((2 * simulations.state_size,), np.uint32)
-        random = [Spec(self._episode[name].shape, self._episode[name].dtype) for name in randomized]
-        results = [state, Spec((), bool), *map(self._spec, simulations.fields)]
-        key = hashlib.sha256(models.digest(simulations.model).encode())
-        key.update(repr((simulations.fields, randomized, self.env.frame_skip, results)).encode())
-        step = _with_steps(simulations, self.env.frame_skip)
-        start_inputs = [Spec((model.nq,), real), Spec((model.nv,), real), *random]
-        step_inputs = [state, Spec((model.nu,), real), Spec((), bool), *random]
-        return (
-            HostCall(f"start_{key.hexdigest()}", simulations.start, start_inputs, results),
-            HostCall(f"step_{key.hexdigest()}", step, step_inputs, results),
-        )
+        num_steps = self.env.frame_skip
+        step = functools.partial(simulations.step, num_steps)
+        inputs = [self._state_spec(), self._spec("ctrl"), Spec((), bool)]
+        return self._host_call("step", num_steps, step, inputs)
+
+    def _host_call(
+        self, kind: str, options: object, function: HostFunction, inputs: Sequence[Spec]
+    ) -> HostCall:
+        """Returns an operation of the simulations.
+
+        Args:
+          kind: part of its name.
+          options: what it depends on besides the model, the task's fields, and those at random.
+          function: what it calls.
+          inputs: what it reads besides the fields at random, which come last.
+        """
+        simulations = self._simulations
+        episode = self._episode
+        random = [Spec(episode[x].shape, episode[x].dtype) for x in simulations.randomized]
+        results = [self._state_spec(), Spec((), bool), *map(self._spec, simulations.fields)]
+        key = hashlib.sha256(self._digest.encode())
+        key.update(repr((simulations.fields, simulations.randomized, options, results)).encode())
+        return HostCall(f"{kind}_{key.hexdigest()}", function, [*inputs, *random], results)
+
+    def _state_spec(self) -> Spec:
+        """Returns the shape and dtype of MuJoCo's state, in halves of float64."""
+        return Spec((2 * self._simulations.state_size,), np.uint32)
 
     def reset(self, rng: jax.Array) -> State:
         """Returns the start of an episode; consumes the key."""
-        episode, (qpos, qvel) = self.env.draw(rng)
-        return self.set_state(qpos, qvel, episode)
+        episode, start = self.env.draw(rng)
+        return self.set_state(**start, episode=episode)
 
-    def set_state(self, qpos: jax.Array, qvel: jax.Array, episode: dict[str, jax.Array]) -> State:
+    def set_state(
+        self,
+        qpos: jax.Array,
+        qvel: jax.Array,
+        episode: dict[str, jax.Array] | None = None,
+        **fields: jax.Array,
+    ) -> State:
         """Returns the state at positions [nq] and velocities [nv], as ``MujocoEnv.set_state``."""
         real = jnp.result_type(float)
-        results = self._start_call(
-            jnp.asarray(qpos, real), jnp.asarray(qvel, real), *self._model_fields(episode)
-        )
+        episode = episode or {}
+        start = {"qpos": qpos, "qvel": qvel, **fields}
+        begin = self._host_start(tuple(start))
+        values = [jnp.asarray(x, real) for x in start.values()]
+        results = begin(*values, *self._model_fields(episode))
         physics, view, _ = self._simulated(results, episode)
         zero = jnp.zeros((), real)
         action = jnp.zeros(self.action_size, real)
@@ -347,7 +384,9 @@ class InBatch(Env):
         """Returns the state one env step later, of an episode that runs [] or is left as it is."""
         check_shape("the action", action, (self.action_size,))
         before = cast(Physics, state.pipeline_state)
-        control = jnp.asarray(action, jnp.result_type(float))
+        name = type(self.env).__name__
+        control = check_control(name, self.env.control(action), action, self.mj_model.nu)
+        control = jnp.asarray(control, jnp.result_type(float))
         results = self._step_call(
             before.carried[STATE], control, running, *self._model_fields(before.episode)
         )
@@ -373,7 +412,7 @@ class InBatch(Env):
         """Returns what the next env step needs, what the task reads, and whether it is sound []."""
         state, sound, *values = results
         fields = dict(zip(self._simulations.fields, values, strict=True))
-        carried = {name: fields[name] for name in self.env.carried} | {STATE: state}
+        carried = {name: fields[name] for name in self._carried} | {STATE: state}
         common = {name: fields[name] for name in models.CARRIED}
         physics = Physics(**common, carried=carried, episode=episode)
         return physics, Before(fields, self.env.mj_model, episode), sound
@@ -417,12 +456,3 @@ class InBatch(Env):
 
     def __repr__(self) -> str:
         return repr(self.env)
-
-
-def _with_steps(simulations: Simulations, num_steps: int) -> Callable[..., None]:
-    """Returns ``Simulations.step`` of so many physics steps."""
-
-    def step(inputs: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
-        simulations.step(num_steps, inputs, results)
-
-    return step

@@ -12,6 +12,7 @@ from mjx_reinforce.engine.base import Environment
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import Before, MujocoEnv
 from mjx_reinforce.envs.in_batch import FieldRecorder, spec_of
+from mjx_reinforce.envs.outcomes import check_control
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco
@@ -64,7 +65,7 @@ class InMujoco:
 
     def reset(self, rng: jax.Array) -> np.ndarray:
         """Begins an episode and returns its first observation [O]; consumes the key."""
-        self._episode, (qpos, qvel) = self._start(rng)
+        self._episode, start = self._start(rng)
         # A copy, since an episode may replace fields of the model.
         self.model = model = copy.copy(self.env.mj_model)
         for name, value in models.replaced(model, self._episode).items():
@@ -73,8 +74,8 @@ class InMujoco:
             for frame_types in (model.body_sameframe, model.geom_sameframe, model.site_sameframe):
                 frame_types[:] = int(_C.mjtSameFrame.mjSAMEFRAME_NONE)
         data = _C.MjData(model)
-        data.qpos[:] = qpos
-        data.qvel[:] = qvel
+        for name, value in start.items():
+            getattr(data, name)[:] = value
         _C.mj_forward(model, data)
         self.data = data
         return np.asarray(self._observe(self._fields(), self._episode))
@@ -88,7 +89,10 @@ class InMujoco:
           action: [A] as the policy gave it.
         """
         before = self._start_fields()
-        self.data.ctrl[:] = action
+        name = type(self.env).__name__
+        # Not compiled: a control of NumPy's numbers keeps their precision.
+        control = self.env.control(action)
+        self.data.ctrl[:] = check_control(name, control, action, self.model.nu)
         _C.mj_step(self.model, self.data, self.env.frame_skip)
         if self.env.contact_forces:
             _C.mj_rnePostConstraint(self.model, self.data)
