@@ -427,7 +427,9 @@ class MujocoEnv(Env):
     @property
     def action_size(self) -> int:
         """The number A of entries of an action: as the action space says, by default nu."""
-        shape = np.shape(getattr(self.action_space, "low", None))
+        # A task may have replaced it by what is no such space, which ``check_environment`` names.
+        space: Any = self.action_space
+        shape = np.shape(getattr(space, "low", ()))
         return shape[0] if len(shape) == 1 else self.mj_model.nu
 
     @property

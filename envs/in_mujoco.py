@@ -1,7 +1,7 @@
 """A task stepped by C MuJoCo: one episode plays at once, where JAX would compile for a minute."""
 
 import copy
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -91,7 +91,7 @@ class InMujoco:
         before = self._start_fields()
         name = type(self.env).__name__
         # Not compiled: a control of NumPy's numbers keeps their precision.
-        control = self.env.control(action)
+        control = self.env.control(cast(Any, action))
         self.data.ctrl[:] = check_control(name, control, action, self.model.nu)
         _C.mj_step(self.model, self.data, self.env.frame_skip)
         if self.env.contact_forces:

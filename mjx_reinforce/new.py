@@ -34,12 +34,13 @@ _HOME_OF_CONTROLS = """\
         self.home = self.mj_model.key_ctrl[0]
 """
 _HOME_OF_SERVOS = """\
+        # The key frame has no controls: the servos aim at its joint angles.
         joints = self.mj_model.actuator_trnid[:, 0]
-        self.home = self.mj_model.key_qpos[0, self.mj_model.jnt_qposadr[joints]]  # servos' targets
+        self.home = self.mj_model.key_qpos[0, self.mj_model.jnt_qposadr[joints]]
 """
 #: How far actions reach: of a robot on its legs less, since noise of all of it throws it down.
 _SCALE = "self.unit"
-_SCALE_ON_LEGS = "np.minimum(self.unit, {reach})  # rad; more makes larger steps, and more falls"
+_SCALE_ON_LEGS = "np.minimum(self.unit, 0.5)  # rad; more makes larger steps, and more falls"
 #: Where an episode starts.
 _POSE = """\
         return jnp.asarray(self.mj_model.qpos0), noise
@@ -48,8 +49,6 @@ _KEY_FRAME = """\
         start = self.key_frame({key})  # with its act and ctrl, and poses of mocap bodies
         return start | {{"qvel": start["qvel"] + noise{ctrl}}}
 """
-#: How far a servo of a robot on its legs reaches at first (rad).
-_REACH = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,45 +118,12 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
     # A robot that stands on its own has a free joint (type 0) first, whose seven numbers are its
     # position and its orientation.
     is_free = bool(model.njnt > 0 and model.jnt_type[0] == 0)
-    joints = [model.joint(i).name for i in range(int(is_free), model.njnt)]
-    observation = []
-    if is_free:
-        # Not where it is on the ground, which should make no difference to a policy.
-        observation.append("qpos[2:7]")
-    if all(joints):
-        observation += [f"joint({json.dumps(name)}).qpos" for name in joints]
-    else:
-        observation.append("qpos[7:]" if is_free else "qpos")
-    observation.append("qvel")
-    if model.nsensor > 0:
-        observation.append("sensordata")
     files = ["new_task.txt", "new_walk.txt" if is_free else "new_hold.txt"]
     template = "".join(Path(__file__).with_name(file).read_text("utf-8") for file in files)
     # Five seconds are an episode.
     num_steps = round(5 / (frame_skip * timestep)) or 1
-    # What a robot without a home or without a free joint needs in these places.
-    placeholders: dict[str, Any] = {
-        "home": "",
-        "imports": "",
-        "effort": "action / self.unit",
-        "start": _POSE,
-        "body": 0,
-        "up": "",
-    }
-    has_controls = bool(model.nkey and model.key_ctrl[0].any())
-    has_servos = _has_servos(model)
-    if model.nkey:
-        ctrl = ""
-        if has_servos and not has_controls:
-            ctrl = ', "ctrl": self.home'
-        key = json.dumps(model.key(0).name or 0)
-        placeholders["start"] = _KEY_FRAME.format(key=key, ctrl=ctrl)
-    if has_controls or (model.nkey and has_servos):
-        home = _HOME_OF_CONTROLS if has_controls else _HOME_OF_SERVOS
-        scale = _SCALE_ON_LEGS.format(reach=_REACH) if is_free and has_servos else _SCALE
-        placeholders["home"] = _HOME.format(home=home, scale=scale, nu=model.nu)
-        placeholders["imports"] = "from mjx_reinforce import Box\n"
-        placeholders["effort"] = "action"
+    placeholders = _start_and_home(model, is_free)
+    array = "ctrl" if placeholders["home"] else "action"
     if is_free:
         placeholders["body"] = int(model.jnt_bodyid[0])
         placeholders["up"] = _up(model)
@@ -170,10 +136,54 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
         steps=num_steps,
         nv=model.nv,
         pose="self.mj_model.key_qpos[0]" if model.nkey else "self.mj_model.qpos0",
-        observed="".join(f"                data.{entry},\n" for entry in observation),
-        about="\n".join(_about(model, "ctrl" if placeholders["home"] else "action")),
+        observed="".join(f"                data.{x},\n" for x in _observation(model, is_free)),
+        about="\n".join(_about(model, array)),
         **placeholders,
     )
+
+
+def _observation(model: "MjModel", is_free: bool) -> Iterator[str]:
+    """Yields the fields of mjData that the policy sees, of a robot with a free joint or without."""
+    if is_free:
+        # Not where it is on the ground, which should make no difference to a policy.
+        yield "qpos[2:7]"
+    joints = [model.joint(i).name for i in range(int(is_free), model.njnt)]
+    if all(joints):
+        yield from (f"joint({json.dumps(name)}).qpos" for name in joints)
+    else:
+        yield "qpos[7:]" if is_free else "qpos"
+    yield "qvel"
+    if model.nsensor > 0:
+        yield "sensordata"
+
+
+def _start_and_home(model: "MjModel", is_free: bool) -> dict[str, Any]:
+    """Returns the parts of the class that depend on the model's key frame and actuators."""
+    # What a robot without a key frame, a home or a free joint needs in these places.
+    placeholders: dict[str, Any] = {
+        "home": "",
+        "imports": "",
+        "effort": "action / self.unit",
+        "start": _POSE,
+        "body": 0,
+        "up": "",
+    }
+    if not model.nkey:
+        return placeholders
+    has_controls = bool(model.key_ctrl[0].any())
+    has_servos = _has_servos(model)
+    ctrl = ""
+    if has_servos and not has_controls:
+        ctrl = ', "ctrl": self.home'
+    key = json.dumps(model.key(0).name or 0)
+    placeholders["start"] = _KEY_FRAME.format(key=key, ctrl=ctrl)
+    if has_controls or has_servos:
+        home = _HOME_OF_CONTROLS if has_controls else _HOME_OF_SERVOS
+        scale = _SCALE_ON_LEGS if is_free and has_servos else _SCALE
+        placeholders["home"] = _HOME.format(home=home, scale=scale, nu=model.nu)
+        placeholders["imports"] = "from mjx_reinforce import Box\n"
+        placeholders["effort"] = "action"
+    return placeholders
 
 
 def _has_servos(model: "MjModel") -> bool:

@@ -283,7 +283,7 @@ class Mistaken(Servo):
 def test_another_number_of_controls_is_named():
     message = r"Mistaken.control must return \[2\], .* got the shape \[1\]; an action is \[1\]"
     env = Mistaken()
-    state = env.reset(jax.random.key(0))
+    state: Any = env.reset(jax.random.key(0))
     for task in (env, env.in_c_mujoco()):
         with pytest.raises(BadEnvironmentError, match=message):
             jax.eval_shape(task.step, task.reset(jax.random.key(0)), jnp.zeros(1))
