@@ -18,16 +18,23 @@ from mjx_reinforce.engine.base import (
     is_kept_whole,
     observation_size,
 )
-from mjx_reinforce.engine.checks import changed_fields, check_count, check_number
+from mjx_reinforce.engine.checks import changed_fields, check_count, check_name, check_number
 from mjx_reinforce.engine.contract import check_shape
 from mjx_reinforce.engine.physics import mjx_internals, sensors
 from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
 from mjx_reinforce.engine.scalar import prune, whole
 from mjx_reinforce.envs import derived, in_batch, models, refusals
-from mjx_reinforce.envs.outcomes import check_centers, check_episode, check_outcome, check_start
+from mjx_reinforce.envs.outcomes import (
+    check_centers,
+    check_control,
+    check_episode,
+    check_outcome,
+    check_start,
+)
 from mjx_reinforce.envs.parts import View
 from mjx_reinforce.envs.settings import EpisodeSettings, build_settings
+from mjx_reinforce.envs.starts import MOCAP, at_rest, key_frame, start_shapes
 from mjx_reinforce.envs.state import Before, Physics
 
 #: A forward pass of C MuJoCo 4.0.
@@ -44,6 +51,11 @@ def _carried(state: "Physics | mjx.Data") -> dict[str, jax.Array]:
     return {name: getattr(state, name) for name in models.CARRIED}
 
 
+def _mocap(fields: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """Returns the poses of mocap bodies among fields of a start, or of what is carried."""
+    return {name: fields[name] for name in MOCAP if name in fields}
+
+
 def _is_sound(data: mjx.Data) -> jax.Array:
     """Returns whether C MuJoCo would go on [], and not reset: ``mj_checkPos``, ``Vel`` and ``Acc``.
 
@@ -56,8 +68,8 @@ def _is_sound(data: mjx.Data) -> jax.Array:
 class MujocoEnv(Env):
     """A task on one MuJoCo model, stepped by MJX as Gymnasium steps MuJoCo.
 
-    One env step is ``frame_skip`` physics steps under the same control. The
-    action is not clipped here: MuJoCo clamps it inside the actuator
+    One env step is ``frame_skip`` physics steps under the same control, by default the action. It
+    is not clipped here: MuJoCo clamps it inside the actuator
     (gymnasium/envs/mujoco/mujoco_env.py, ``do_simulation``). Truncation is the
     trainer's: ``max_episode_steps`` says when.
 
@@ -116,8 +128,15 @@ class MujocoEnv(Env):
         )
 
     @abc.abstractmethod
-    def initial(self, rng: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Draws the start of an episode: qpos [nq] and qvel [nv]; consumes the key."""
+    def initial(self, rng: jax.Array) -> tuple[jax.Array, jax.Array] | dict[str, jax.Array] | str:
+        """Draws the start of an episode; consumes the key.
+
+        Returns:
+          qpos [nq] and qvel [nv]; or fields of mjData by their names: "qpos", "qvel", "act" [na],
+          "ctrl" [nu], "mocap_pos" [nmocap, 3] and "mocap_quat" [nmocap, 4]; or the name of a key
+          frame, for all of it but its time. What is missing is as the model has it. Poses of mocap
+          bodies hold for the episode.
+        """
 
     @abc.abstractmethod
     def outcome(
@@ -132,6 +151,22 @@ class MujocoEnv(Env):
             names, as ``data.site("tip").xpos`` (see ``parts.Named``), and ``data.episode``.
           action: [A] as the policy gave it.
         """
+
+    def control(self, action: jax.Array) -> jax.Array:
+        """Returns the controls [nu] that an action [A] applies (ctrl); by default the action.
+
+        With ``self.home + self.scale * action``, and an ``action_space`` of [-1, 1], a policy acts
+        around a pose. Actions may have another size than controls: that of the ``action_space``.
+        """
+        return action
+
+    def key_frame(self, name: str | int) -> dict[str, jax.Array]:
+        """Returns a key frame by its name or number, all but its time, as ``initial`` may return.
+
+        Raises:
+          ValueError: the model has no such key frame.
+        """
+        return key_frame(self.mj_model, name)
 
     def randomize(self, rng: jax.Array) -> dict[str, Any]:
         """Draws what differs from episode to episode; by default nothing. Consumes the key.
@@ -156,10 +191,13 @@ class MujocoEnv(Env):
     def reset(self, rng: jax.Array) -> State:
         """Returns the start of an episode; consumes the key."""
         episode, start = self.draw(rng)
-        return self.set_state(*start, episode)
+        return self.set_state(**start, episode=episode)
 
-    def draw(self, rng: jax.Array) -> tuple[dict[str, jax.Array], tuple[jax.Array, jax.Array]]:
-        """Returns what ``randomize`` and ``initial`` return, checked; consumes the key."""
+    def draw(self, rng: jax.Array) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
+        """Returns what ``randomize`` and ``initial`` return, checked; consumes the key.
+
+        The start is by mjData's names, "qpos" and "qvel" among them.
+        """
         name = type(self).__name__
         episode = {}
         # A task that draws nothing consumes no key for it, so that its starts are those of ``rng``.
@@ -168,11 +206,18 @@ class MujocoEnv(Env):
             episode = check_episode(name, self.randomize(key), self.mj_model)
             if "body_ipos" in episode:
                 check_centers(name, self.randomize, self.mj_model.body_ipos, self.mj_model)
-        sizes = self.mj_model.nq, self.mj_model.nv
-        return episode, check_start(name, self.initial(rng), sizes)
+        start = self.initial(rng)
+        if isinstance(start, str):
+            start = self.key_frame(start)
+        fields = check_start(name, start, start_shapes(self.mj_model))
+        return episode, at_rest(self.mj_model) | fields
 
     def set_state(
-        self, qpos: jax.Array, qvel: jax.Array, episode: dict[str, jax.Array] | None = None
+        self,
+        qpos: jax.Array,
+        qvel: jax.Array,
+        episode: dict[str, jax.Array] | None = None,
+        **fields: jax.Array,
     ) -> State:
         """Returns the state at given positions and velocities, as Gymnasium's ``set_state``.
 
@@ -180,16 +225,19 @@ class MujocoEnv(Env):
           qpos: [nq] generalized positions (m, rad).
           qvel: [nv] generalized velocities (m/s, rad/s).
           episode: what the task's ``randomize`` returns, where it has one.
+          **fields: what else ``initial`` may return, as ``ctrl`` [nu]; by default as the model has.
         """
-        check_shape("qpos", qpos, (self.mj_model.nq,))
-        check_shape("qvel", qvel, (self.mj_model.nv,))
+        shapes = start_shapes(self.mj_model)
+        for field, value in {"qpos": qpos, "qvel": qvel, **fields}.items():
+            check_name("field of a start", field, shapes)
+            check_shape(field, value, shapes[field])
         # What MJX refuses, C MuJoCo plays, whoever asks.
         if self.refusal is not None:
-            return self._in_c_mujoco.set_state(qpos, qvel, episode or {})
+            return self._in_c_mujoco.set_state(qpos, qvel, episode, **fields)
         # Whether the physics stays whole is asked during tracing, and the jitted start may have
         # been traced where it does not.
         start = self._forward_state if is_kept_whole() else self._start
-        return start(qpos, qvel, episode or {})
+        return start(qpos, qvel, episode or {}, fields)
 
     @property
     def model(self) -> mjx.Model:
@@ -250,10 +298,14 @@ class MujocoEnv(Env):
         return forward, _step_of(model, forward)
 
     def _forward_state(
-        self, qpos: jax.Array, qvel: jax.Array, episode: dict[str, jax.Array]
+        self,
+        qpos: jax.Array,
+        qvel: jax.Array,
+        episode: dict[str, jax.Array],
+        fields: dict[str, jax.Array],
     ) -> State:
-        """Returns the state at positions and velocities, from one forward pass."""
-        start_data = models.make_data(self.mj_model).replace(qpos=qpos, qvel=qvel)
+        """Returns the state at positions, velocities and other fields, from one forward pass."""
+        start_data = models.make_data(self.mj_model).replace(qpos=qpos, qvel=qvel, **fields)
         constants = derived.constants(self.mj_model, episode)
         # MJX normalizes quaternions in qpos itself; MuJoCo does so when it steps.
         if self._stays_whole(episode):
@@ -261,7 +313,7 @@ class MujocoEnv(Env):
         else:
             forward, _ = self._physics_of(episode, constants)
             data = physics.like(forward(start_data).replace(qpos=qpos), start_data)
-        state = self._physics(data, episode, constants)
+        state = self._physics(data, episode, constants, _mocap(fields))
         view = View(data, self.mj_model, episode)
         # No env step was made: the outcome says only which terms there are, each 0 so far. Wrappers
         # and loops need a state of one structure from the first step on.
@@ -280,7 +332,8 @@ class MujocoEnv(Env):
             return self._in_c_mujoco.step(state, action)
         before = cast(Any, state.pipeline_state)
         # All else in mjData follows from what is carried, or stays as the model has it.
-        start_data = models.make_data(self.mj_model).replace(**_carried(before))
+        mocap = _mocap(before.carried)
+        start_data = models.make_data(self.mj_model).replace(**_carried(before), **mocap)
         _, physics_step = self._physics_of(before.episode, before.constants)
 
         def advance(_: int, carry: tuple[mjx.Data, jax.Array]) -> tuple[mjx.Data, jax.Array]:
@@ -289,7 +342,9 @@ class MujocoEnv(Env):
             data = physics.like(physics_step(data), data)
             return data, is_sound & _is_sound(data)
 
-        start_data = start_data.replace(ctrl=jnp.asarray(action, start_data.ctrl.dtype))
+        name = type(self).__name__
+        control = check_control(name, self.control(action), action, self.mj_model.nu)
+        start_data = start_data.replace(ctrl=jnp.asarray(control, start_data.ctrl.dtype))
         if self._stays_whole(before.episode):
             data, is_sound = self._whole("physics", start_data)
         else:
@@ -304,7 +359,7 @@ class MujocoEnv(Env):
         dtype = state.reward.dtype
         return dataclasses.replace(
             state,
-            pipeline_state=self._physics(data, before.episode, before.constants),
+            pipeline_state=self._physics(data, before.episode, before.constants, mocap),
             obs=self.observe(view),
             reward=jnp.where(is_sound, jnp.asarray(reward, dtype), jnp.nan),
             done=jnp.asarray(terminated, dtype),
@@ -351,13 +406,27 @@ class MujocoEnv(Env):
         return check_outcome(type(self).__name__, self.outcome(before, data, action))
 
     def _physics(
-        self, data: mjx.Data, episode: dict[str, jax.Array], constants: dict[str, jax.Array]
+        self,
+        data: mjx.Data,
+        episode: dict[str, jax.Array],
+        constants: dict[str, jax.Array],
+        mocap: dict[str, jax.Array],
     ) -> Physics:
-        """Returns what the next env step needs to know of a simulation."""
+        """Returns what the next env step needs to know of a simulation.
+
+        Args:
+          data: the simulation.
+          episode: what ``randomize`` returned.
+          constants: what MuJoCo derives from that, see ``derived.constants``.
+          mocap: the poses of mocap bodies that are not as the model has them.
+        """
         # ``Simulation`` has MuJoCo's names, wherever MJX keeps the fields.
         carried_fields = {name: getattr(Simulation(data), name) for name in self.carried}
         return Physics(
-            **_carried(data), carried=carried_fields, episode=episode, constants=constants
+            **_carried(data),
+            carried=carried_fields | mocap,
+            episode=episode,
+            constants=constants,
         )
 
     @property
@@ -375,8 +444,11 @@ class MujocoEnv(Env):
 
     @property
     def action_size(self) -> int:
-        """The number A of entries of an action."""
-        return self.mj_model.nu
+        """The number A of entries of an action: as the action space says, by default nu."""
+        # A task may have replaced it by what is no such space, which ``check_environment`` names.
+        space: Any = self.action_space
+        shape = np.shape(getattr(space, "low", ()))
+        return shape[0] if len(shape) == 1 else self.mj_model.nu
 
     @property
     def backend(self) -> str:

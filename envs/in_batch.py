@@ -24,11 +24,12 @@ from mujoco.batch import DATA_FIELDS, Batch, SimulationError
 
 from mjx_reinforce.engine.base import MjModel, observation_size
 from mjx_reinforce.engine.contract import check_shape
-from mjx_reinforce.engine.cpu.host import HostCall, Spec
+from mjx_reinforce.engine.cpu.host import HostCall, HostFunction, Spec
 from mjx_reinforce.engine.memory import gigabytes, host_memory, num_cores
 from mjx_reinforce.envs import models
-from mjx_reinforce.envs.outcomes import check_outcome
+from mjx_reinforce.envs.outcomes import check_control, check_outcome
 from mjx_reinforce.envs.parts import Named
+from mjx_reinforce.envs.starts import MOCAP, start_shapes
 from mjx_reinforce.envs.state import Before, Physics
 
 #: MuJoCo's own names; it is a C extension without stubs.
@@ -150,23 +151,31 @@ class Simulations:
         """The numbers of mjtState that MuJoCo carries from step to step."""
         return _C.mj_stateSize(self.model, _C.mjtState.mjSTATE_INTEGRATION)
 
-    def start(self, inputs: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
-        """Begins episodes: a forward pass at given positions and velocities.
+    def start(
+        self, names: Sequence[str], inputs: Sequence[np.ndarray], results: Sequence[np.ndarray]
+    ) -> None:
+        """Begins episodes: a forward pass at given positions, velocities and other fields.
 
         Args:
-          inputs: qpos [B, nq], qvel [B, nv], the randomized fields of the model [B, ...].
-          results: state [B, S], sound [B] and the fields [B, ...], which are written.
+          names: of the fields that are not as the model has them.
+          inputs: which episodes begin [B], those fields [B, ...], the randomized fields of the
+            model [B, ...].
+          results: state [B, S], sound [B] and the fields [B, ...], which are written; those of an
+            episode that does not begin have no meaning.
         """
-        qpos, qvel, *model_fields = inputs
+        starting, *arrays = inputs
+        start_fields = arrays[: len(names)]
+        model_fields = arrays[len(names) :]
+        ids = np.flatnonzero(starting)
         with self._lock:
-            batch = self._batch(len(qpos))
+            batch = self._batch(len(starting))
             # Clears what an episode before has left: activations, warm starts, delays, warnings.
-            batch.reset(stage=_C.mjtStage.mjSTAGE_NONE)
+            batch.reset(ids=ids, stage=_C.mjtStage.mjSTAGE_NONE)
             warnings = self._warnings(batch)
-            self._set_model(batch, model_fields, np.arange(batch.nsim))
-            batch.bind("qpos")[:] = qpos
-            batch.bind("qvel")[:] = qvel
-            failed = self._failed(batch, batch.forward)
+            self._set_model(batch, model_fields, ids)
+            for name, values in zip(names, start_fields, strict=True):
+                batch.bind(name)[ids] = values[ids]
+            failed = self._failed(batch, functools.partial(batch.forward, ids=ids))
             self._write(batch, failed | (self._warnings(batch) > warnings), results)
 
     def step(
@@ -176,10 +185,11 @@ class Simulations:
 
         Args:
           num_steps: physics steps, under the same control.
-          inputs: state [B, S], control [B, nu], running [B], the randomized fields of the model.
+          inputs: which episodes run [B], state [B, S], control [B, nu], the randomized fields of
+            the model.
           results: as of ``start``; those of an episode that does not run have no meaning.
         """
-        state, control, running, *model_fields = inputs
+        running, state, control, *model_fields = inputs
         ids = np.flatnonzero(running)
         with self._lock:
             batch = self._batch(len(state))
@@ -188,11 +198,8 @@ class Simulations:
             batch.bind("ctrl")[:] = control
             warnings = self._warnings(batch)
             self._set_model(batch, model_fields, ids)
-            failed = np.zeros(batch.nsim, bool)
-            if ids.size:
-                failed = self._failed(
-                    batch, functools.partial(batch.step, ids=ids, nstep=num_steps)
-                )
+            advance = functools.partial(batch.step, ids=ids, nstep=num_steps)
+            failed = self._failed(batch, advance)
             self._write(batch, failed | (self._warnings(batch) > warnings), results)
             if self.contact_forces:
                 self._write_contact_forces(batch, ids, results)
@@ -310,19 +317,25 @@ class InBatch(Env):
         self.max_episode_steps = env.max_episode_steps
         self.reward_threshold = env.reward_threshold
         self.action_space = env.action_space
+        # Those of mocap bodies are not always as the model has them.
+        self._carried = env.carried
+        if env.mj_model.nmocap:
+            self._carried = (*env.carried, *MOCAP)
+        self._episode = jax.eval_shape(env.draw, jax.random.key(0))[0]
+        randomized = [name for name in models.RANDOM if name in self._episode]
         # Not kept: of some models the arena alone has gigabytes.
         data = _C.MjData(env.mj_model)
+        fields = self._fields_read(data)
+        self._specs = {name: spec_of(data, name) for name in (*fields, *start_shapes(env.mj_model))}
         self._constants = {
             name: np.array(getattr(data, name), spec_of(data, name).dtype)
             for name in models.CONSTANT
         }
-        self._episode = jax.eval_shape(env.draw, jax.random.key(0))[0]
-        randomized = [name for name in models.RANDOM if name in self._episode]
-        fields = self._fields_read(data)
         self._simulations = Simulations(
             env.mj_model, fields, randomized, contact_forces=env.contact_forces
         )
-        self._start_call, self._step_call = self._host_calls(data, randomized)
+        self._digest = models.digest(env.mj_model)
+        self._step_call = self._host_step()
 
     def _fields_read(self, data: Any) -> list[str]:
         """Returns the fields of mjData that the task reads, and those that an env step hands on."""
@@ -333,41 +346,84 @@ class InBatch(Env):
             before = Before(start_fields, self.env.mj_model, episode)
             return self.env.outcome(before, recorder, action), self.env.observe(recorder)
 
-        names = (*models.CARRIED, *models.CONSTANT, *self.env.carried)
+        names = (*models.CARRIED, *models.CONSTANT, *self._carried)
         specs = {name: spec_of(data, name) for name in names}
         start_fields = {name: jnp.zeros(spec.shape, spec.dtype) for name, spec in specs.items()}
         jax.eval_shape(read, start_fields, self._episode, jnp.zeros(self.env.action_size))
-        return sorted({*recorder.names, *models.CARRIED, *self.env.carried})
+        return sorted({*recorder.names, *models.CARRIED, *self._carried})
 
-    def _host_calls(self, data: Any, randomized: Sequence[str]) -> tuple[HostCall, HostCall]:
-        """Returns the operations that begin an episode and that advance one."""
-        model = self.env.mj_model
-        real = jnp.result_type(float)
+    def _host_start(self, names: tuple[str, ...]) -> HostCall:
+        """Returns the operation that begins an episode, given fields of mjData by their names."""
+        start = functools.partial(self._simulations.start, names)
+        inputs = [self._specs[name] for name in names]
+        return self._host_call("start", names, start, [Spec((), bool), *inputs])
+
+    def _host_step(self) -> HostCall:
+        """Returns the operation that advances an episode."""
+        num_steps = self.env.frame_skip
+        step = functools.partial(self._simulations.step, num_steps)
+        inputs = [Spec((), bool), self._state_spec(), self._specs["ctrl"]]
+        return self._host_call("step", num_steps, step, inputs)
+
+    def _host_call(
+        self, kind: str, options: object, function: HostFunction, inputs: Sequence[Spec]
+    ) -> HostCall:
+        """Returns an operation of the simulations.
+
+        Args:
+          kind: part of its name.
+          options: what it depends on besides the model, the task's fields, and those at random.
+          function: what it calls.
+          inputs: what it reads besides the fields at random, which come last.
+        """
         simulations = self._simulations
-        state = Spec((2 * simulations.state_size,), np.uint32)
-        random = [Spec(self._episode[name].shape, self._episode[name].dtype) for name in randomized]
-        results = [state, Spec((), bool), *(spec_of(data, name) for name in simulations.fields)]
-        key = hashlib.sha256(models.digest(simulations.model).encode())
-        key.update(repr((simulations.fields, randomized, self.env.frame_skip, results)).encode())
-        step = _with_steps(simulations, self.env.frame_skip)
-        start_inputs = [Spec((model.nq,), real), Spec((model.nv,), real), *random]
-        step_inputs = [state, Spec((model.nu,), real), Spec((), bool), *random]
-        return (
-            HostCall(f"start_{key.hexdigest()}", simulations.start, start_inputs, results),
-            HostCall(f"step_{key.hexdigest()}", step, step_inputs, results),
+        episode = self._episode
+        random = [Spec(episode[x].shape, episode[x].dtype) for x in simulations.randomized]
+        field_specs = [self._specs[name] for name in simulations.fields]
+        results = [self._state_spec(), Spec((), bool), *field_specs]
+        key = hashlib.sha256(self._digest.encode())
+        dependencies = (
+            simulations.fields,
+            simulations.randomized,
+            simulations.contact_forces,
+            options,
+            results,
         )
+        key.update(repr(dependencies).encode())
+        return HostCall(f"{kind}_{key.hexdigest()}", function, [*inputs, *random], results)
+
+    def _state_spec(self) -> Spec:
+        """Returns the shape and dtype of MuJoCo's state, in halves of float64."""
+        return Spec((2 * self._simulations.state_size,), np.uint32)
 
     def reset(self, rng: jax.Array) -> State:
         """Returns the start of an episode; consumes the key."""
-        episode, (qpos, qvel) = self.env.draw(rng)
-        return self.set_state(qpos, qvel, episode)
+        return self.reset_where(rng, jnp.array(True))
 
-    def set_state(self, qpos: jax.Array, qvel: jax.Array, episode: dict[str, jax.Array]) -> State:
+    def reset_where(self, rng: jax.Array, where: jax.Array) -> State:
+        """Does as ``reset`` where an episode is to begin []; else what it returns means nothing."""
+        episode, start = self.env.draw(rng)
+        return self._start(start, episode, where)
+
+    def set_state(
+        self,
+        qpos: jax.Array,
+        qvel: jax.Array,
+        episode: dict[str, jax.Array] | None = None,
+        **fields: jax.Array,
+    ) -> State:
         """Returns the state at positions [nq] and velocities [nv], as ``MujocoEnv.set_state``."""
+        start = {"qpos": qpos, "qvel": qvel, **fields}
+        return self._start(start, episode or {}, jnp.array(True))
+
+    def _start(
+        self, start: dict[str, jax.Array], episode: dict[str, jax.Array], where: jax.Array
+    ) -> State:
+        """Returns the state of an episode that starts with fields of mjData, where it is to []."""
         real = jnp.result_type(float)
-        results = self._start_call(
-            jnp.asarray(qpos, real), jnp.asarray(qvel, real), *self._model_fields(episode)
-        )
+        begin = self._host_start(tuple(start))
+        start_fields = [jnp.asarray(x, real) for x in start.values()]
+        results = begin(where, *start_fields, *self._model_fields(episode))
         physics, view, _ = self._simulated(results, episode)
         zero = jnp.zeros((), real)
         action = jnp.zeros(self.action_size, real)
@@ -380,19 +436,22 @@ class InBatch(Env):
 
         The reward is NaN where C MuJoCo has begun again, or has left something out.
         """
-        return self._step(state, action, jnp.array(True))
+        return self.step_where(state, action, jnp.array(True))
 
     def step_unfinished(self, state: State, action: jax.Array) -> State:
-        """Does as ``step``; what it returns of an episode that was over has no meaning."""
-        return self._step(state, action, (state.done == 0) & jnp.isfinite(state.reward))
+        """Does as ``step``; what it returns of an episode that was over means nothing."""
+        is_running = (state.done == 0) & jnp.isfinite(state.reward)
+        return self.step_where(state, action, is_running)
 
-    def _step(self, state: State, action: jax.Array, running: jax.Array) -> State:
-        """Returns the state one env step later, of an episode that runs [] or is left as it is."""
+    def step_where(self, state: State, action: jax.Array, where: jax.Array) -> State:
+        """Does as ``step`` where an episode goes on []; else what it returns means nothing."""
         check_shape("the action", action, (self.action_size,))
         before = cast(Physics, state.pipeline_state)
-        control = jnp.asarray(action, jnp.result_type(float))
+        name = type(self.env).__name__
+        control = check_control(name, self.env.control(action), action, self.mj_model.nu)
+        control = jnp.asarray(control, jnp.result_type(float))
         results = self._step_call(
-            before.carried[STATE], control, running, *self._model_fields(before.episode)
+            where, before.carried[STATE], control, *self._model_fields(before.episode)
         )
         physics, view, sound = self._simulated(results, before.episode)
         reward, terminated, terms = self._outcome(before, view, action)
@@ -416,9 +475,9 @@ class InBatch(Env):
         """Returns what the next env step needs, what the task reads, and whether it is sound []."""
         state, sound, *values = results
         fields = dict(zip(self._simulations.fields, values, strict=True))
-        carried = {name: fields[name] for name in self.env.carried} | {STATE: state}
+        carried = {name: fields[name] for name in self._carried} | {STATE: state}
         common = {name: fields[name] for name in models.CARRIED}
-        physics = Physics(**common, carried=carried, episode=episode)
+        physics = Physics(**common, carried=carried, episode=episode, constants={})
         return physics, Before(fields, self.env.mj_model, episode), sound
 
     def _outcome(self, before: Physics, view: Any, action: jax.Array) -> Any:
@@ -455,12 +514,3 @@ class InBatch(Env):
 
     def __repr__(self) -> str:
         return repr(self.env)
-
-
-def _with_steps(simulations: Simulations, num_steps: int) -> Callable[..., None]:
-    """Returns ``Simulations.step`` of so many physics steps."""
-
-    def step(inputs: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
-        simulations.step(num_steps, inputs, results)
-
-    return step

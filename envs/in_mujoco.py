@@ -1,7 +1,7 @@
 """A task stepped by C MuJoCo: one episode plays at once, where JAX would compile for a minute."""
 
 import copy
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from mjx_reinforce.engine.base import Environment
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import Before, MujocoEnv
 from mjx_reinforce.envs.in_batch import FieldRecorder, spec_of
+from mjx_reinforce.envs.outcomes import check_control
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco
@@ -64,7 +65,7 @@ class InMujoco:
 
     def reset(self, rng: jax.Array) -> np.ndarray:
         """Begins an episode and returns its first observation [O]; consumes the key."""
-        self._episode, (qpos, qvel) = self._start(rng)
+        self._episode, start = self._start(rng)
         # A copy, since an episode may replace fields of the model.
         self.model = model = copy.copy(self.env.mj_model)
         data = _C.MjData(model)
@@ -73,8 +74,8 @@ class InMujoco:
                 getattr(model, name)[:] = field
             _C.mj_setConst(model, data)
             _C.mj_resetData(model, data)
-        data.qpos[:] = qpos
-        data.qvel[:] = qvel
+        for name, field in start.items():
+            getattr(data, name)[:] = field
         _C.mj_forward(model, data)
         self.data = data
         return np.asarray(self._observe(self._fields(), self._episode))
@@ -88,7 +89,10 @@ class InMujoco:
           action: [A] as the policy gave it.
         """
         before = self._start_fields()
-        self.data.ctrl[:] = action
+        name = type(self.env).__name__
+        # Not compiled: a control of NumPy's numbers keeps their precision.
+        control = self.env.control(cast(Any, action))
+        self.data.ctrl[:] = check_control(name, control, action, self.model.nu)
         _C.mj_step(self.model, self.data, self.env.frame_skip)
         if self.env.contact_forces:
             _C.mj_rnePostConstraint(self.model, self.data)

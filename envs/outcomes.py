@@ -1,6 +1,7 @@
 """Checks of what a task's methods return, while they are traced."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -21,24 +22,62 @@ _MODEL_FIELDS = frozenset(field.name for field in dataclasses.fields(cast(Any, m
 _DRAWS = 8
 
 
-def check_start(name: str, start: object, sizes: tuple[int, int]) -> tuple[Any, Any]:
-    """Returns what ``initial`` returned, if it is positions and velocities.
+def check_start(
+    name: str, start: object, shapes: dict[str, tuple[int, ...]]
+) -> dict[str, jax.Array]:
+    """Returns what ``initial`` returned by mjData's names, if it is where an episode can start.
 
     Args:
       name: of the task.
-      start: what it returned.
-      sizes: nq and nv of the model.
+      start: what it returned: qpos and qvel, or fields by their names.
+      shapes: of each field with which an episode may start, as ``starts.start_shapes`` has them.
+
+    Returns:
+      The fields without those that have no entries in the model.
 
     Raises:
       ValueError: it is something else.
     """
-    pair = start if isinstance(start, tuple | list) else ()
-    require(len(pair) == 2, f"{name}.initial must return qpos and qvel, got {in_words(start)}")
-    for field, value, size in zip(("qpos", "qvel"), pair, sizes, strict=True):
-        requirement = f"{name}.initial must return {field} [{size}], as the model has it"
-        require(shape_of(value) == (size,), f"{requirement}, got {in_words(value)}")
-    qpos, qvel = (jnp.asarray(x, jnp.result_type(x, float)) for x in pair)  # also of integers
-    return qpos, qvel
+    fields: Any = start
+    if isinstance(start, tuple | list) and len(start) == 2:
+        fields = dict(zip(("qpos", "qvel"), start, strict=True))
+    require(
+        isinstance(fields, dict),
+        f"{name}.initial must return qpos and qvel, a dict of fields of mjData, or the name of a "
+        f"key frame, got {in_words(start)}",
+    )
+    arrays: dict[str, jax.Array] = {}
+    for field, value in fields.items():
+        require(
+            field in shapes,
+            f"{name}.initial cannot start with {field!r}; it can with {', '.join(shapes)}",
+        )
+        shape = shapes[field]
+        requirement = f"{name}.initial must return {field} {[*shape]}, as the model has it"
+        require(shape_of(value) == shape, f"{requirement}, got {in_words(value)}")
+        if math.prod(shape):
+            arrays[field] = jnp.asarray(value, jnp.result_type(value, float))  # also of integers
+    return arrays
+
+
+def check_control(name: str, control: Any, action: Any, size: int) -> Any:
+    """Returns what ``control`` returned, if it is a control for each actuator.
+
+    Args:
+      name: of the task.
+      control: what it returned.
+      action: [A] what it was given.
+      size: nu of the model.
+
+    Raises:
+      ValueError: it is something else.
+    """
+    require(
+        shape_of(control) == (size,),
+        f"{name}.control must return [{size}], a control for each actuator, got "
+        f"{in_words(control)}; an action is {[*action.shape]}, as the action_space says",
+    )
+    return control
 
 
 def check_episode(name: str, episode: object, model: MjModel) -> dict[str, jax.Array]:

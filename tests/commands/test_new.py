@@ -14,6 +14,7 @@ from places import ROOT
 
 import mjx_reinforce as mr
 from mjx_reinforce import envs, new
+from mjx_reinforce.engine import choose
 
 EXAMPLES = ROOT / "experiments" / "examples"
 SENSED = """<mujoco><option timestep="0.002"/><worldbody>
@@ -95,8 +96,10 @@ def test_a_walker_starts_in_its_key_frame(tmp_path, monkeypatch):
     write(monkeypatch, "kept.xml")
     monkeypatch.syspath_prepend(tmp_path)
     env, home = envs.make("kept:Kept"), np.array([0, 0, 0.2, 0.6, 0, 0.8, 0, -1])
-    qpos, qvel = env.initial(jax.random.key(0))
-    np.testing.assert_allclose(qpos, home, atol=1e-6)
+    start = env.initial(jax.random.key(0))
+    qvel = start["qvel"]
+    np.testing.assert_allclose(start["qpos"], home, atol=1e-6)
+    np.testing.assert_allclose(start["ctrl"], [-0.5])
     assert 0 < np.abs(qvel).max() < 0.1
     state = env.set_state(jnp.asarray(home), qvel)
     np.testing.assert_allclose(state.obs[:6], home[2:], atol=1e-6)
@@ -105,7 +108,8 @@ def test_a_walker_starts_in_its_key_frame(tmp_path, monkeypatch):
     moved = home + np.array([env.dt, 0, -0.1, 0, 0, 0, 0, 0])
     fallen = types.SimpleNamespace(qpos=moved, xmat=upright)
     tilted = types.SimpleNamespace(qpos=home, xmat=np.array([np.eye(3), np.eye(3)]))
-    action = jnp.array([-0.5])  # that of the key frame costs nothing
+    action = jnp.zeros(1)  # that of the key frame costs nothing
+    np.testing.assert_allclose(env.control(action), [-0.5])
     found = [env.outcome(stands, after, action)[:2] for after in (stands, fallen, tilted)]
     assert found == [(1, False), (pytest.approx(2), True), (1, True)]
     lint("kept.py")
@@ -134,10 +138,40 @@ def test_an_untrained_policy_holds_the_key_frame(tmp_path, monkeypatch):
         state = step(state, learner.policy.distribution.mode(outputs))
         assert state.obs[0] == pytest.approx(2.2, abs=0.1)
         assert state.metrics["reward_control"] > -0.01
-    assert env.outcome(state.pipeline_state, state.pipeline_state, jnp.array([2.2, 255.0]))[2][
-        "reward_control"
-    ] == pytest.approx(-0.04)
+    np.testing.assert_allclose(env.control(jnp.array([0.0, 2.0])), [2.2, 255.0], rtol=1e-6)
+    reward = env.outcome(state.pipeline_state, state.pipeline_state, jnp.array([0.0, 2.0]))
+    assert reward[2]["reward_control"] == pytest.approx(-0.04)
     lint("servo.py")
+
+
+def test_servos_whose_key_frame_has_no_controls_hold_its_angles(tmp_path, monkeypatch):
+    """Also on legs, where actions reach less far."""
+    text = SENSED.replace("<joint axis", '<joint name="j" range="-120 -30" axis')
+    servo = '<position joint="j" kp="20" ctrlrange="-2 2"/>'
+    text = text.replace('<motor joint="j"/>', servo)
+    key = '<keyframe><key name="stand" qpos="0 0 .2 1 0 0 0 -1"/></keyframe></mujoco>'
+    (tmp_path / "legs.xml").write_text(text.replace("</mujoco>", key))
+    monkeypatch.chdir(tmp_path)
+    write(monkeypatch, "legs.xml")
+    monkeypatch.syspath_prepend(tmp_path)
+    env = envs.make("legs:Legs")
+    np.testing.assert_allclose(env.control(np.array([0.0])), [-1.0])
+    np.testing.assert_allclose(env.control(np.array([1.0])), [-0.5])
+    np.testing.assert_allclose(env.initial(jax.random.key(0))["ctrl"], [-1.0])
+    assert (env.action_space.low, env.action_space.high) == (-1, 1)
+    lint("legs.py")
+
+
+def test_a_model_that_mjx_refuses_is_played_by_c_mujoco(tmp_path, monkeypatch, capsys):
+    arm = (EXAMPLES / "my_arm.xml").read_text()
+    (tmp_path / "pgs.xml").write_text(arm.replace("<option", '<option solver="PGS"'))
+    monkeypatch.chdir(tmp_path)
+    write(monkeypatch, "pgs.xml")
+    assert "C MuJoCo will play it: MJX has no mjSOL_PGS\n" in capsys.readouterr().out
+    monkeypatch.syspath_prepend(tmp_path)
+    env = envs.make("pgs:Pgs")
+    assert choose("auto", env).name == "mujoco"
+    assert np.isfinite(env.step(env.reset(jax.random.key(0)), jnp.zeros(3)).reward)
 
 
 def test_an_unstable_model_is_named(tmp_path, monkeypatch, capsys):
@@ -160,7 +194,6 @@ WRONG = {
     "arm.xml --output there.py": "there.py exists; pass --overwrite",
     "still.xml": "has no actuators",
     "broken.xml": "MuJoCo cannot compile",
-    "pgs.xml": 'set <option solver="Newton"/>',
 }
 
 
@@ -168,7 +201,6 @@ WRONG = {
 def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments):
     arm = (EXAMPLES / "my_arm.xml").read_text()
     texts = {"arm": arm, "still": "<mujoco/>", "broken": "<mujoco"}
-    texts["pgs"] = arm.replace("<option", '<option solver="PGS"')
     for name, text in texts.items():
         (tmp_path / f"{name}.xml").write_text(text)
     (tmp_path / "there.py").write_text("")

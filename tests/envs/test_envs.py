@@ -194,19 +194,20 @@ def equal(x, y):
 # -------------------------------------------------------------------------------------------------
 # Checks of what a task's methods return: a wrong shape is named in one line.
 
-SIZES = (3, 2)
+SIZES = {"qpos": (3,), "qvel": (2,), "act": (0,)}
 
 
 def test_a_start_of_the_model_s_sizes_passes():
-    qpos, qvel = check_start("Task", (np.arange(3), jnp.zeros(2)), SIZES)
-    assert jnp.issubdtype(qpos.dtype, jnp.floating)
-    assert (qpos.tolist(), qvel.tolist()) == ([0, 1, 2], [0, 0])
+    start = check_start("Task", (np.arange(3), jnp.zeros(2)), SIZES)
+    assert jnp.issubdtype(start["qpos"].dtype, jnp.floating)
+    assert {name: x.tolist() for name, x in start.items()} == {"qpos": [0, 1, 2], "qvel": [0, 0]}
+    assert not check_start("Task", {"act": np.zeros(0)}, SIZES)  # of which the model has none
 
 
 @pytest.mark.parametrize(
     ("start", "message"),
     [
-        (np.zeros(3), r"must return qpos and qvel, got the shape \[3\]"),
+        (np.zeros(3), r"must return qpos and qvel, .* got the shape \[3\]"),
         ((np.zeros(2), np.zeros(2)), r"must return qpos \[3\], .* got the shape \[2\]"),
         ([np.zeros(3), np.zeros((2, 1))], r"must return qvel \[2\]"),
     ],

@@ -180,7 +180,7 @@ def make_peer(env_id: str, tolerance: float | None = None) -> Peer:
 class Ours:
     """Our environment, compiled once for a batch.
 
-    draw: typed keys [B] -> qpos and qvel of starts
+    draw: typed keys [B] -> qpos and qvel of starts, by name
     place: qpos and qvel, [B, ...] -> states
     step: states and actions, [B, ...] -> states
     """
@@ -192,15 +192,15 @@ class Ours:
         self.place: Callable[..., Any] = jax.jit(jax.vmap(self.env.set_state))
         self.step: Callable[..., Any] = jax.jit(jax.vmap(self.env.step))
 
-    def _draw(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def _draw(self, key: jax.Array) -> dict[str, jax.Array]:
         if isinstance(self.env, MujocoEnv):  # without a forward pass, which takes seconds to trace
             return self.env.draw(key)[1]
         physics = self.env.reset(key).pipeline_state
-        return physics.qpos, physics.qvel
+        return {"qpos": physics.qpos, "qvel": physics.qvel}
 
     def reset(self, seed: int) -> Any:
         """Returns a batch of starts."""
-        return self.place(*self.draw(jax.random.split(jax.random.key(seed), self.batch)))
+        return self.place(**self.draw(jax.random.split(jax.random.key(seed), self.batch)))
 
     def starts(self, seed: int, count: int) -> Outcome:
         """Returns at least ``count`` starts, a seed a batch."""

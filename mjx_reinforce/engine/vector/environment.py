@@ -7,7 +7,7 @@ episode draws from the environment's own key alone, so what one plays does not d
 import enum
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -108,23 +108,36 @@ def advance_function(env: Environment, limit: int | None, autoreset: str) -> Cal
     def advance(state: VectorState, action: PyTree, is_start: jax.Array) -> VectorState:
         """Plays a step or begins an episode; with ``same_step`` it does both where one ends."""
         if autoreset == "same_step":
-            step = _play(env, limit, state, action)
-            start = lax.cond(is_start | step.done, lambda: _begin(env, state.keys), lambda: step)
+            step = _play(env, limit, state, action, ~is_start)
+            resets = is_start | step.done
+            start = lax.cond(resets, lambda: _begin(env, state.keys, resets), lambda: step)
             # Reward, flags and the last observation stay those of the step that ended the episode.
             start_state = step.replace(simulation=start.simulation, keys=start.keys)
             return jax.tree.map(lambda x, y: jnp.where(is_start, x, y), start, start_state)
         resets = is_start | (state.done if autoreset == "next_step" else False)
         return lax.cond(
-            resets, lambda: _begin(env, state.keys), lambda: _play(env, limit, state, action)
+            resets,
+            lambda: _begin(env, state.keys, resets),
+            lambda: _play(env, limit, state, action, ~resets),
         )
 
     return advance
 
 
-def _begin(env: Environment, keys: jax.Array) -> VectorState:
-    """Returns an environment at the start of its next episode, of keys as of ``VectorState``."""
+def _begin(env: Environment, keys: jax.Array, where: bool | jax.Array = True) -> VectorState:
+    """Returns an environment at the start of its next episode.
+
+    Args:
+      env: what is played.
+      keys: as of ``VectorState``.
+      where: [] whether the result is used. Mapped over environments, both sides of a condition are
+        computed; an environment with a ``reset_where`` computes no more than it must.
+    """
     key, reset_key = jax.random.split(key_of_words(keys))
-    start = env.reset(reset_key)
+    if hasattr(type(env), "reset_where"):
+        start = cast(Any, env).reset_where(reset_key, jnp.asarray(where))
+    else:
+        start = env.reset(reset_key)
     is_done = jnp.zeros((), bool)
     zero = jnp.zeros_like(start.reward)
     return VectorState(
@@ -141,10 +154,18 @@ def _begin(env: Environment, keys: jax.Array) -> VectorState:
     )
 
 
-def _play(env: Environment, limit: int | None, state: VectorState, action: PyTree) -> VectorState:
-    """Returns an environment one step later; an episode that is over begins to count again."""
+def _play(
+    env: Environment, limit: int | None, state: VectorState, action: PyTree, where: jax.Array
+) -> VectorState:
+    """Returns an environment one step later; an episode that is over begins to count again.
+
+    ``where`` [] is as of ``_begin``.
+    """
     is_over = state.done
-    simulation = env.step(state.simulation, action)
+    if hasattr(type(env), "step_where"):
+        simulation = cast(Any, env).step_where(state.simulation, action, where)
+    else:
+        simulation = env.step(state.simulation, action)
     is_finite = jnp.all(jnp.isfinite(simulation.obs)) & jnp.isfinite(simulation.reward)
     is_finite &= jnp.isfinite(simulation.done)
     reward = jnp.where(is_finite, simulation.reward, 0)
