@@ -1,9 +1,11 @@
 """Judges one model in a process of its own, with limits of time and memory."""
 
+import contextlib
 import multiprocessing
 import os
 import re
 import resource
+import signal
 import tempfile
 import time
 import traceback
@@ -91,6 +93,20 @@ def words(message: object, path: Path) -> str:
     return text[:_MAX_WORDS]
 
 
+def _kill(process: Any) -> None:
+    """Kills a process, and the compilers that it has started, which would outlive it."""
+    children = [
+        int(pid)
+        for path in Path(f"/proc/{process.pid}/task").glob("*/children")
+        for pid in path.read_text().split()
+    ]
+    process.kill()
+    process.join()
+    for pid in children:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+
 def judged(question: Question, path: Path, mechanisms: dict[str, str]) -> dict[str, Any]:
     """Returns what a process of its own finds out about a model."""
     # A server has imported everything once, before any thread of JAX's; each model is its child.
@@ -105,7 +121,7 @@ def judged(question: Question, path: Path, mechanisms: dict[str, str]) -> dict[s
     try:
         while receiver.poll(max(0.0, deadline - time.monotonic())):
             row |= receiver.recv()
-        process.kill()
+        _kill(process)
         return row | {"verdict": "too long", "cause": f"over {question.seconds:g} s"}
     except EOFError:  # the process has ended
         process.join()

@@ -210,15 +210,14 @@ def equality(model: Any, name: str) -> dict[str, Any]:
     start = start_of(model)
     env = Generic(model, start, _FRAME_SKIPS["equality"])
     policy = policy_of(start, model.opt.timestep)
-    in_words = choose("auto", env)  # without a policy, nothing is compiled
+    default = choose("auto", env)  # without a policy nothing is compiled
     start_time = time.perf_counter()
     engine = choose(name, env, policy, STEPS + 2)
     rolled_out, actions = by_rollout(engine, env, policy)
     seconds = time.perf_counter() - start_time
-    row: dict[str, Any] = {"engine": engine.name, "seconds": f"{seconds:.1f}"}
-    # Where auto takes C MuJoCo, too, this row is also that of auto.
-    row["auto"] = in_words.name if in_words.name == "mujoco" else name == "auto" and engine.name
-    row["why"] = in_words.why if in_words.name == "mujoco" else engine.why
+    row = {"engine": engine.name, "why": engine.why, "seconds": f"{seconds:.1f}"}
+    if default.name == "mujoco":  # then this row is that of auto, too
+        row |= {"auto": "mujoco", "why": default.why}
     episodes = {"rollout": rolled_out, "make_vec": by_make_vec(name, env, actions)}
     return row | _verdict(episodes, model, start, actions)
 
