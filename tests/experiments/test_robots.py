@@ -1,0 +1,79 @@
+"""Robots of others are judged beside C MuJoCo, each by a process of its own."""
+
+import itertools
+
+import pytest
+
+from experiments.checks.robots import __main__ as robots
+from experiments.checks.robots import page, playing
+from experiments.kit import rows
+
+#: A slide that a motor pushes against a wall; {} are options.
+MODEL = """
+<mujoco>
+  <option {option}/>
+  <worldbody>
+    <geom type="plane" size="1 1 .1"/>
+    <body pos="0 0 .1">
+      <joint name="slide" type="slide" axis="0 0 1"/>
+      <geom size=".1"/>
+    </body>
+  </worldbody>
+  {actuator}
+  <sensor><jointvel joint="slide"/></sensor>
+</mujoco>
+"""
+MOTOR = '<actuator><motor joint="slide" ctrlrange="-9 9"/></actuator>'
+
+
+def write_models(folder):
+    """Writes two robots, one of them twice, one that has no motor, and a part of a model."""
+    folder.mkdir(parents=True)
+    elliptic = MODEL.format(option='cone="elliptic"', actuator=MOTOR)
+    (folder / "elliptic.xml").write_text(elliptic)
+    (folder / "elliptic_again.xml").write_text(elliptic)
+    (folder / "pyramidal.xml").write_text(MODEL.format(option="", actuator=MOTOR))
+    (folder / "still.xml").write_text(MODEL.format(option="", actuator=""))
+    (folder / "part.xml").write_text('<mujoco><include file="nowhere.xml"/></mujoco>')
+    (folder / "other.xml").write_text("<robots/>")
+
+
+def test_each_model_has_a_row_and_is_judged_once(tmp_path):
+    write_models(tmp_path / "package" / "assets")
+    path = tmp_path / "rows.csv"
+    for phase in ("equality", "speed", "equality"):
+        robots.main(robots.Settings(phase, path, tmp_path))
+    raw_rows = rows.read(path)
+    assert len(raw_rows) == 5 + 2
+    by_name = {row["model"].removeprefix("assets/"): row for row in page.merged(raw_rows)}
+    assert {name: row["verdict"] for name, row in by_name.items()} == {
+        "elliptic.xml": "equal",
+        "elliptic_again.xml": "same mechanism",
+        "pyramidal.xml": "equal",
+        "still.xml": "no actuators",
+        "part.xml": "no model",
+    }
+    slow, fast = by_name["elliptic.xml"], by_name["pyramidal.xml"]
+    assert (slow["engine"], slow["why"]) == ("mujoco", "elliptic cones")
+    assert fast["engine"] == "native"
+    for row in (slow, fast):
+        assert float(row["error"]) <= playing.EQUAL
+        assert float(row["ratio"]) > 0
+
+
+@pytest.mark.parametrize(
+    ("name", "place"), itertools.product(("observation", "reward"), ((-1,), (0,)))
+)
+def test_a_difference_is_seen_wherever_it_is(name, place):
+    expected = playing.Played(*map(playing.np.ones, ((4, 3), 3, 3)))
+    array = getattr(expected, name).copy()
+    array[place] += 1e-6
+    error, words = playing.difference(expected._replace(**{name: array}), expected)
+    assert error == pytest.approx(1e-6)
+    assert words.startswith(name)
+
+
+def test_the_page_is_that_of_the_rows():
+    text = page.PAGE.read_text(encoding="utf-8")
+    assert page.page(text, rows.read(page.CSV)) == text
+    assert "### " in text
