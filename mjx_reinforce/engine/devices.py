@@ -39,9 +39,18 @@ def check_room(num_bytes: float) -> None:
         )
 
 
-def executable(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
-    """Returns a compiled program, on a GPU without trials of kernels."""
-    options = _GPU_OPTIONS if jax.default_backend() == "gpu" else None
+def executable(lowered: jax.stages.Lowered, cpu_level: int | None = None) -> jax.stages.Compiled:
+    """Returns a compiled program, on a GPU without trials of kernels.
+
+    Args:
+      lowered: the program.
+      cpu_level: how far XLA optimizes for a CPU, from 0 to 3; None leaves it to XLA.
+    """
+    options: dict[str, Any] | None = None
+    if jax.default_backend() == "gpu":
+        options = _GPU_OPTIONS
+    elif cpu_level is not None:
+        options = {"xla_backend_optimization_level": cpu_level}
     return lowered.compile(compiler_options=options)
 
 

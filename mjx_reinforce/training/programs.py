@@ -271,6 +271,7 @@ class Programs(NamedTuple):
     advance_evaluates: whether ``advance`` evaluates; else ``evaluate`` does, before it
     like: the shapes of a ``RunState``
     division: among which devices the runs are divided; R are those of one device
+    calls_c: whether C MuJoCo computes the physics
     """
 
     begin: Callable[..., tuple[jax.Array, jax.Array]]
@@ -279,6 +280,7 @@ class Programs(NamedTuple):
     advance_evaluates: bool
     like: RunState
     division: Division = ALONE
+    calls_c: bool = False
 
     @property
     def state_bytes(self) -> int:
@@ -375,4 +377,7 @@ def programs_of(
     settings = {name: jax.ShapeDtypeStruct((num_runs,), jnp.result_type(float)) for name in traced}
     state_shapes = jax.eval_shape(states, np.uint32(0), numbers, settings)
     state_rows = StateRows(state_shapes)
-    return Programs(begin, advance, evaluate_rows, advance_evaluates, state_shapes, division)
+    calls_c = learner.engine.name == "mujoco"
+    return Programs(
+        begin, advance, evaluate_rows, advance_evaluates, state_shapes, division, calls_c
+    )
