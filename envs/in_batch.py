@@ -400,10 +400,10 @@ class InBatch(Env):
         """Returns the start of an episode; consumes the key."""
         return self.reset_where(rng, jnp.array(True))
 
-    def reset_where(self, rng: jax.Array, where: jax.Array) -> State:
+    def reset_where(self, rng: jax.Array, is_used: jax.Array) -> State:
         """Does as ``reset`` where an episode is to begin []; else what it returns means nothing."""
         episode, start = self.env.draw(rng)
-        return self._start(start, episode, where)
+        return self._start(start, episode, is_used)
 
     def set_state(
         self,
@@ -417,13 +417,13 @@ class InBatch(Env):
         return self._start(start, episode or {}, jnp.array(True))
 
     def _start(
-        self, start: dict[str, jax.Array], episode: dict[str, jax.Array], where: jax.Array
+        self, start: dict[str, jax.Array], episode: dict[str, jax.Array], is_used: jax.Array
     ) -> State:
         """Returns the state of an episode that starts with fields of mjData, where it is to []."""
         real = jnp.result_type(float)
         begin = self._host_start(tuple(start))
         start_fields = [jnp.asarray(x, real) for x in start.values()]
-        results = begin(where, *start_fields, *self._model_fields(episode))
+        results = begin(is_used, *start_fields, *self._model_fields(episode))
         physics, view, _ = self._simulated(results, episode)
         zero = jnp.zeros((), real)
         action = jnp.zeros(self.action_size, real)
@@ -443,7 +443,7 @@ class InBatch(Env):
         is_running = (state.done == 0) & jnp.isfinite(state.reward)
         return self.step_where(state, action, is_running)
 
-    def step_where(self, state: State, action: jax.Array, where: jax.Array) -> State:
+    def step_where(self, state: State, action: jax.Array, is_used: jax.Array) -> State:
         """Does as ``step`` where an episode goes on []; else what it returns means nothing."""
         check_shape("the action", action, (self.action_size,))
         before = cast(Physics, state.pipeline_state)
@@ -451,7 +451,7 @@ class InBatch(Env):
         control = check_control(name, self.env.control(action), action, self.mj_model.nu)
         control = jnp.asarray(control, jnp.result_type(float))
         results = self._step_call(
-            where, before.carried[STATE], control, *self._model_fields(before.episode)
+            is_used, before.carried[STATE], control, *self._model_fields(before.episode)
         )
         physics, view, sound = self._simulated(results, before.episode)
         reward, terminated, terms = self._outcome(before, view, action)

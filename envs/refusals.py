@@ -289,7 +289,8 @@ def best_in_c(model: MjModel) -> str | None:
     MJX may not run the model as C MuJoCo does, or leave it to MJX's own solver, which is slow: this
     package's solvers know pyramidal cones, joint limits, equalities and friction losses.
     """
-    reasons = [*dict.fromkeys(feature for feature, _ in _reasons(model))]
+    # Without the names of geoms, which ``check_supported`` lists: this is part of a line.
+    reasons = [*dict.fromkeys(feature.partition(" (")[0] for feature, _ in _reasons(model))]
     if len(reasons) > 1:
         return f"{reasons[0]}, and {len(reasons) - 1} more"
     if reasons:

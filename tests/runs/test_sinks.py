@@ -42,7 +42,7 @@ def begin(directory, config):
     """Begins a run in a directory, or goes on without a checkpoint."""
     record = SimpleNamespace(env_steps=np.zeros(1))
     run = SimpleNamespace(config=config, updates=lambda: 0, record=record)
-    group_plan = SimpleNamespace(ready=SimpleNamespace(policy={}))
+    group_plan = SimpleNamespace(ready=SimpleNamespace(policy={}, engine="vmap"))
     plan = SimpleNamespace(saved_record={}, checkpoint=None, group_plans=[group_plan])
     files = RunFiles(directory, plan, lambda text: None)
     files.open()

@@ -124,18 +124,18 @@ def advance_function(env: Environment, limit: int | None, autoreset: str) -> Cal
     return advance
 
 
-def _begin(env: Environment, keys: jax.Array, where: bool | jax.Array = True) -> VectorState:
+def _begin(env: Environment, keys: jax.Array, is_used: bool | jax.Array = True) -> VectorState:
     """Returns an environment at the start of its next episode.
 
     Args:
       env: what is played.
       keys: as of ``VectorState``.
-      where: [] whether the result is used. Mapped over environments, both sides of a condition are
+      is_used: [] whether the result is used. Mapped over environments, both sides of a condition are
         computed; an environment with a ``reset_where`` computes no more than it must.
     """
     key, reset_key = jax.random.split(key_of_words(keys))
     if hasattr(type(env), "reset_where"):
-        start = cast(Any, env).reset_where(reset_key, jnp.asarray(where))
+        start = cast(Any, env).reset_where(reset_key, jnp.asarray(is_used))
     else:
         start = env.reset(reset_key)
     is_done = jnp.zeros((), bool)
@@ -155,15 +155,15 @@ def _begin(env: Environment, keys: jax.Array, where: bool | jax.Array = True) ->
 
 
 def _play(
-    env: Environment, limit: int | None, state: VectorState, action: PyTree, where: jax.Array
+    env: Environment, limit: int | None, state: VectorState, action: PyTree, is_used: jax.Array
 ) -> VectorState:
     """Returns an environment one step later; an episode that is over begins to count again.
 
-    ``where`` [] is as of ``_begin``.
+    ``is_used`` [] is as of ``_begin``.
     """
     is_over = state.done
     if hasattr(type(env), "step_where"):
-        simulation = cast(Any, env).step_where(state.simulation, action, where)
+        simulation = cast(Any, env).step_where(state.simulation, action, is_used)
     else:
         simulation = env.step(state.simulation, action)
     is_finite = jnp.all(jnp.isfinite(simulation.obs)) & jnp.isfinite(simulation.reward)
