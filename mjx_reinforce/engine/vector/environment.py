@@ -130,8 +130,8 @@ def _begin(env: Environment, keys: jax.Array, is_used: bool | jax.Array = True) 
     Args:
       env: what is played.
       keys: as of ``VectorState``.
-      is_used: [] whether the result is used. Mapped over environments, both sides of a condition are
-        computed; an environment with a ``reset_where`` computes no more than it must.
+      is_used: [] whether the result is used. Mapped over environments, both sides of a condition
+        are computed; an environment with a ``reset_where`` computes no more than it must.
     """
     key, reset_key = jax.random.split(key_of_words(keys))
     if hasattr(type(env), "reset_where"):
