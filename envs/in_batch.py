@@ -248,7 +248,7 @@ class Simulations:
             field = batch.expand(name)
             episode_values = values.reshape(field.shape).astype(field.dtype)
             differs = field[ids] != episode_values[ids]
-            changed[ids] |= differs.reshape(len(ids), -1).any(1)
+            changed[ids] |= differs.any(axis=tuple(range(1, differs.ndim)))
             field[ids] = episode_values[ids]
         # It takes as long as a few steps, and an episode's model stays what it was when it began.
         if changed.any():

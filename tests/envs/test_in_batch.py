@@ -219,6 +219,16 @@ def test_random_masses_are_those_of_a_model_compiled_with_them(float64):
     np.testing.assert_array_equal(observations[:, 2], np.stack(expected))
 
 
+def test_no_episode_needs_to_run(float64):
+    """A step in which none does is one of no simulation, also where models are drawn."""
+    task = RandomCart().in_c_mujoco()
+    keys = jax.random.split(jax.random.key(7), 2)
+    state = jax.jit(jax.vmap(task.reset))(keys)
+    over = state.replace(done=jnp.ones(2))
+    after = jax.jit(jax.vmap(task.step_unfinished))(over, jnp.zeros((2, 2)))
+    assert after.obs.shape == state.obs.shape
+
+
 class FeltCart(Cart):
     """It also observes the forces of contacts on its bodies."""
 
