@@ -51,6 +51,9 @@ _BROKEN = (
 _SPARSE = ("M", "actuator_moment", "flexedge_J", "qLD", "ten_J")
 #: What C computes after a step by ``mj_rnePostConstraint``, which ``mj_step`` does not call.
 _CONTACT_FORCES = ("cacc", "cfrc_ext", "cfrc_int")
+#: XLA may make several calls at once. A batch is used by one thread at a time, and has all cores;
+#: what MuJoCo prints is a setting of the process.
+_LOCK = threading.Lock()
 #: Simulations of models that need an MjData each keep it for this many sizes of a batch.
 _KEPT_BATCHES = 3
 
@@ -143,8 +146,6 @@ class Simulations:
         self.randomized = tuple(randomized)
         self.num_threads = num_cores()
         self._batches: dict[int, Batch] = {}
-        #: A batch is used by one thread at a time; XLA may make several calls at once.
-        self._lock = threading.Lock()
 
     @property
     def state_size(self) -> int:
@@ -167,7 +168,7 @@ class Simulations:
         start_fields = arrays[: len(names)]
         model_fields = arrays[len(names) :]
         ids = np.flatnonzero(starting)
-        with self._lock:
+        with _LOCK:
             batch = self._batch(len(starting))
             # Clears what an episode before has left: activations, warm starts, delays, warnings.
             batch.reset(ids=ids, stage=_C.mjtStage.mjSTAGE_NONE)
@@ -191,8 +192,10 @@ class Simulations:
         """
         running, state, control, *model_fields = inputs
         ids = np.flatnonzero(running)
-        with self._lock:
+        with _LOCK:
             batch = self._batch(len(state))
+            if self._sleeps():
+                _check_same(batch.state[ids], state.view(np.float64)[ids])
             # The rows say all that there is of a simulation: it may have been another before.
             batch.state[:] = state.view(np.float64)
             batch.bind("ctrl")[:] = control
@@ -223,11 +226,14 @@ class Simulations:
             self._batches[num_episodes] = batch
         return self._batches[num_episodes]
 
+    def _sleeps(self) -> bool:
+        """Returns whether bodies may sleep: MuJoCo keeps which of them do outside of its state."""
+        return bool(self.model.opt.enableflags & _C.mjtEnableBit.mjENBL_SLEEP)
+
     def _needs_own_data(self) -> bool:
         """Returns whether a simulation has something that its state does not say."""
-        sleeps = self.model.opt.enableflags & _C.mjtEnableBit.mjENBL_SLEEP
         # Contact forces follow from all of mjData as the last step left it.
-        return bool(sleeps) or self.model.nplugin > 0 or self.contact_forces
+        return self._sleeps() or self.model.nplugin > 0 or self.contact_forces
 
     def _check_memory(self, num_episodes: int) -> None:
         """Raises ValueError where the arenas of so many simulations fit in no memory."""
@@ -299,6 +305,21 @@ class Simulations:
             _C.mj_rnePostConstraint(model, data)
             for name in names:
                 fields[name][number] = getattr(data, name)
+
+
+def _check_same(left: np.ndarray, resumed: np.ndarray) -> None:
+    """Raises ValueError unless episodes with bodies that sleep go on where a batch left them.
+
+    Args:
+      left: [N, S] the states in which the batch left them.
+      resumed: [N, S] those from which they are to go on.
+    """
+    if left.tobytes() != resumed.tobytes():
+        raise ValueError(
+            "which bodies sleep is no part of MuJoCo's state, and other episodes were played in "
+            "between, or these from an earlier state; play a batch of episodes from its start to "
+            'its end before the next one, or remove <flag sleep="enable"/> from the model'
+        )
 
 
 class InBatch(Env):

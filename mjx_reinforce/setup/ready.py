@@ -147,11 +147,15 @@ def build_ready(
             return learner
         if config.algorithm != "reinforce":
             return build(env, dataclasses.replace(config, **settings)).learner
-        # How REINFORCE plays depends on no traced number, and takes a second to write out.
+        # How REINFORCE plays depends on no traced number, and machine code takes a second to write
+        # out. These engines write nothing, and vmap refuses what C MuJoCo alone plays.
+        idle_engine: Any = "vmap"
+        if learner.engine.name == "mujoco":
+            idle_engine = "mujoco"
         with warnings.catch_warnings(action="ignore"):  # this engine does not play
-            vmap_config = dataclasses.replace(config, engine="vmap", **settings)
-            vmap_learner = build(env, vmap_config).learner
-        return learner._replace(init=vmap_learner.init, learn=vmap_learner.learn)
+            idle_config = dataclasses.replace(config, engine=idle_engine, **settings)
+            idle_learner = build(env, idle_config).learner
+        return learner._replace(init=idle_learner.init, learn=idle_learner.learn)
 
     @functools.cache
     def programs() -> Programs:

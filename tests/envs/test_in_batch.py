@@ -14,6 +14,8 @@ from mjx_reinforce import envs, make_vec, reinforce, train_step
 from mjx_reinforce.engine.play import choice
 from mjx_reinforce.envs import in_batch
 from mjx_reinforce.envs.base import MujocoEnv
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.setup.ready import build_ready
 
 #: MuJoCo's own names; it is a C extension without stubs.
 mujoco: Any = mujoco_bindings
@@ -227,6 +229,41 @@ def test_no_episode_needs_to_run(float64):
     over = state.replace(done=jnp.ones(2))
     after = jax.jit(jax.vmap(task.step_unfinished))(over, jnp.zeros((2, 2)))
     assert after.obs.shape == state.obs.shape
+
+
+#: Beside the cart, which cannot sleep since it has actuators, a box does.
+SLEEP = {
+    **SIMPLE,
+    "size": '<option><flag sleep="enable"/></option>',
+    "terrain": '<body pos="1 0 .06"><freejoint/><geom type="box" size=".05 .05 .05"/></body>',
+}
+
+
+def test_bodies_sleep_as_in_c_and_never_for_another_episode(float64):
+    env = Cart(**SLEEP)
+    task = env.in_c_mujoco()
+    keys, actions = jax.random.split(jax.random.key(1), 2), np.zeros((200, 2, 2))
+    observations, _ = stepped(task, keys, actions)
+    alone = SteppedByC(env.mj_model, observations[0, 1])
+    expected = [alone.observe(), *(alone.step(action) for action in actions[:, 1])]
+    np.testing.assert_array_equal(observations[:, 1], np.stack(expected))
+    assert alone.data.ntree_awake < env.mj_model.ntree
+    # Which bodies sleep is in no state: a batch cannot play two sets of episodes in turn.
+    step = jax.vmap(task.step)
+    first, second = (jax.vmap(task.reset)(jax.random.split(keys[i], 2)) for i in range(2))
+    step(second, jnp.zeros((2, 2)))
+    with pytest.raises(
+        (RuntimeError, ValueError), match="which bodies sleep is no part of MuJoCo's state"
+    ):
+        jax.block_until_ready(step(first, jnp.zeros((2, 2))))
+
+
+def test_a_sweep_trains_what_mjx_refuses():
+    """Its programs are built with traced settings, for which no engine plays."""
+    config = Config(num_episodes=2, eval_episodes=1, horizon=5, hidden_sizes=(2,))
+    plan = build_ready(Cart(**MODELS["noslip"]), config, traced=("learning_rate",))
+    assert plan.engine == "mujoco"
+    assert plan.programs().state_bytes
 
 
 class FeltCart(Cart):
