@@ -137,7 +137,7 @@ def compare_with_c(env, task, key, tolerance):
 
 
 @pytest.mark.parametrize("name", STARTS)
-@pytest.mark.parametrize("engine", ["vmap", "mujoco"])
+@pytest.mark.parametrize("engine", [pytest.param("vmap", marks=pytest.mark.slow), "mujoco"])
 def test_episodes_from_all_starts_are_cs(float64, engine, name):
     env = Finger(STARTS[name])
     task = env if engine == "vmap" else env.in_c_mujoco()
