@@ -68,7 +68,6 @@ def _lacking_options(model: Any) -> Iterable[tuple[str, Any]]:
     yield "a solver other than Newton", opt.solver != _C.mjtSolver.mjSOL_NEWTON
     limits = f"few iterations of its solver ({opt.iterations}, {opt.ls_iterations} along a line)"
     yield limits, stops_early(model)
-    yield "elliptic friction cones", opt.cone != _C.mjtCone.mjCONE_PYRAMIDAL
     flags = opt.disableflags | opt.enableflags | opt.disableactuator
     yield "flags that disable or enable parts of the physics", flags
     yield "noslip iterations", opt.noslip_iterations

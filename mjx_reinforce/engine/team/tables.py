@@ -30,6 +30,7 @@ _HEADERS = [
     "dynamics",
     "impedance",
     "bounds",
+    "cones",
     "contact_rows",
     "rounds",
     "boxes",
@@ -46,8 +47,9 @@ _HEADERS = [
 NUM_NEAR = 8
 #: How a degree of freedom moves what it carries, by ``device/kinematics.h``.
 _TURNS, _SHIFTS, _SHIFTS_IN_THE_WORLD = range(3)
-#: MuJoCo's mjMINVAL, mjMINIMP and mjMAXIMP.
+#: MuJoCo's mjMINVAL, mjMINMU, mjMINIMP and mjMAXIMP.
 _MIN_VALUE = 1e-15
+_MIN_FRICTION = 1e-5
 _MIN_IMPEDANCE = 1e-4
 _MAX_IMPEDANCE = 1 - 1e-4
 _NO_LIMIT = 1e30
@@ -60,12 +62,14 @@ class _ContactKind(NamedTuple):
     margin: (m)
     friction: along the two tangents, about the normal, about the two tangents
     soft: the number of the softness
+    soft_friction: that of the rows of friction of an elliptic cone
     """
 
     dim: int
     margin: float
     friction: tuple[float, ...]
     soft: int
+    soft_friction: int
 
 
 def physics_text(mj_model: MjModel, num_near: int = NUM_NEAR) -> str:
@@ -93,7 +97,7 @@ def physics_text(mj_model: MjModel, num_near: int = NUM_NEAR) -> str:
 def far_words(mj_model: MjModel, num_near: int = NUM_NEAR) -> int:
     """Returns how many 4-byte words of memory the contacts need that a team has no room for."""
     sizes = _Tables(mj_model, num_near).constants
-    contact_words = 13 + 5 * sizes["CD"]  # the Contact of state.h
+    contact_words = 13 + 5 * sizes["CD"] + sizes["ELLIPTIC"]  # the Contact of state.h
     words = max(0, int(sizes["NI"] - sizes["NEAR"])) * int(contact_words)
     return words + words % 2  # numbers of 8 bytes may follow
 
@@ -132,6 +136,7 @@ class _Tables:
         self.constants["NU"] = max(model.nu, 1)
         self.constants["IMPLICIT"] = self._implicit()
         self.constants["RK4"] = int(model.opt.integrator == _C.mjtIntegrator.mjINT_RK4)
+        self.constants["ELLIPTIC"] = self._is_elliptic()
         self.constants["ANY_POWER"] = int(any(x.power != 2 for x in self.soft))
         self.reals["soft"] = list(self.soft)
         self.reals["gravity"] = model.opt.gravity
@@ -150,9 +155,12 @@ class _Tables:
         # In float32 a step that lowers the cost by less is rounding; in float64 the search goes on
         # until no row changes.
         gain = 1e-10 * self.model.stat.meaninertia * self.model.nv
+        # The cost of an elliptic cone that slides is not quadratic: no step is the last by itself.
+        # Newton's method squares the error, so that after a step of such a gain nothing is left.
+        exact_gain = 1e-10 * gain if self._is_elliptic() else 0
         initial_values = [
             f"real({float(self.model.opt.timestep)!r})",
-            f"SINGLE ? real({float(gain)!r}) : real(0)",
+            f"SINGLE ? real({float(gain)!r}) : real({float(exact_gain)!r})",
         ]
         for type_name, literal, arrays in (
             ("int", lambda x: f"{int(x):d}", self.ints),
@@ -169,6 +177,9 @@ class _Tables:
         lines += records.checks()
         lines.append("#define MODEL_INIT {" + ",\\\n".join(initial_values) + "}")
         return "\n".join(lines)
+
+    def _is_elliptic(self) -> bool:
+        return self.model.opt.cone == _C.mjtCone.mjCONE_ELLIPTIC
 
     def _implicit(self) -> int:
         """Returns how damping is implicit: 0 not at all, 1 of joints, 2 of actuators, too."""
@@ -486,7 +497,7 @@ class _Tables:
             kind = kind_numbers.setdefault(contact_kind, len(kind_numbers))
             bodies = model.geom_bodyid[[pair.geom1, pair.geom2]]
             weight = sum(model.body_invweight0[body, 0] for body in bodies)
-            if contact_kind.dim > 1:
+            if contact_kind.dim > 1 and not self._is_elliptic():
                 # Of an edge of the pyramid, which pushes along a tangent, too.
                 friction = contact_kind.friction[0]
                 weight *= 2 * friction**2 / model.opt.impratio * (1 + friction**2)
@@ -497,11 +508,18 @@ class _Tables:
         self.ints["item"] = items
         self.ints["item_kind"] = item_kinds
         self.reals["item_weight"] = weights
-        rows = list(kind_numbers) or [_ContactKind(dim=1, margin=0.0, friction=(0.0,) * 5, soft=0)]
+        rows = list(kind_numbers) or [_ContactKind(1, 0.0, (0.0,) * 5, 0, 0)]
         self.ints["kind_dim"] = [x.dim for x in rows]
         self.ints["kind_soft"] = [x.soft for x in rows]
         self.reals["kind_margin"] = [x.margin for x in rows]
         self.reals["kind_friction"] = [x.friction for x in rows]
+        self.reals["kind_mu"] = []
+        self.ints["kind_soft_friction"] = []
+        if self._is_elliptic():
+            # C's regularized friction of the cone.
+            root = np.sqrt(max(model.opt.impratio, _MIN_VALUE))
+            self.reals["kind_mu"] = [x.friction[0] / root for x in rows]
+            self.ints["kind_soft_friction"] = [x.soft_friction for x in rows]
         self.constants["NI"] = len(items)
         self.constants["NEAR"] = max(1, min(num_near, len(items)))
         self.constants["CD"] = max(x.dim for x in rows)
@@ -545,11 +563,15 @@ class _Tables:
         """Returns condim, margin, friction and softness of contacts, as C mixes them."""
         model = self.model
         if pair.pair >= 0:
+            ref = model.pair_solref[pair.pair]
+            friction_ref = model.pair_solreffriction[pair.pair]
+            imp = model.pair_solimp[pair.pair]
             return _ContactKind(
                 dim=int(model.pair_dim[pair.pair]),
                 margin=float(model.pair_margin[pair.pair]),
-                friction=tuple(map(float, model.pair_friction[pair.pair])),
-                soft=self._soft(model.pair_solref[pair.pair], model.pair_solimp[pair.pair]),
+                friction=_friction(model.pair_friction[pair.pair]),
+                soft=self._soft(ref, imp),
+                soft_friction=self._soft(friction_ref if friction_ref.any() else ref, imp),
             )
         # mj_contactParam: the geom of higher priority decides alone.
         geoms = [pair.geom1, pair.geom2]
@@ -571,10 +593,16 @@ class _Tables:
             is_direct = (refs[:, 0] <= 0).any()
             ref = refs.min(0) if is_direct else share * refs[0] + (1 - share) * refs[1]
             imp = share * imps[0] + (1 - share) * imps[1]
-        slide, spin, roll = map(float, friction)
+        soft = self._soft(ref, imp)
         return _ContactKind(
             dim=int(dim),
             margin=float(model.geom_margin[geoms].sum()),
-            friction=(slide, slide, spin, roll, roll),
-            soft=self._soft(ref, imp),
+            friction=_friction(friction[[0, 0, 1, 2, 2]]),
+            soft=soft,
+            soft_friction=soft,
         )
+
+
+def _friction(coefficients: np.ndarray) -> tuple[float, ...]:
+    """Returns the friction of a contact; less than MuJoCo's mjMINMU is mjMINMU."""
+    return tuple(map(float, np.maximum(coefficients, _MIN_FRICTION)))

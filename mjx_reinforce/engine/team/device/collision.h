@@ -57,10 +57,14 @@ DEV Contact contact_of(const Model& M, const State& s, int item, const Touch& to
   const real strength = impedance(soft, distance);
   c.item = item;
   c.constraint_mass = constraint_mass(strength, M.item_weight[item]);
+  // A pair may name a softness of the rows of friction of a cone.
+  const real friction_damping =
+      ELLIPTIC ? M.soft[M.kind_soft_friction[kind]].damping : soft.damping;
   real speed[CD];
   relative(M, s.velocity, c, speed);
   relative(M, s.motion, c, c.residual);
-  for (int k = 0; k < CD; k++) c.residual[k] += soft.damping * speed[k];
+  for (int k = 0; k < CD; k++)
+    c.residual[k] += (k > 0 ? friction_damping : soft.damping) * speed[k];
   c.residual[0] += soft.stiffness * strength * distance;
   return c;
 }

@@ -1,4 +1,5 @@
-// Rows of contacts: the edges of friction pyramids, in the basis of normal and tangents.
+// Rows of contacts, in the basis of normal and tangents; of pyramids, whose rows are edges, also
+// their costs. Those of elliptic cones are in cones.h.
 #pragma once
 
 // How the second body of a contact moves at the contact, as the first one sees it, in the contact's
@@ -27,6 +28,16 @@ DEV void basis(const Model& M, const State& s, const Contact& c, int i, real* ou
   for (int k = 0; k < CD; k++)
     out[k] = k < 3 ? dot(c.frame + 3 * k, point) : sign * dot(c.frame + 3 * (k - 3), a.x);
 }
+// What a contact's stiffness makes of x [CD].
+DEV void stiffness_times(const Contact& c, const real* x, real* out) {
+  real along = x[0];
+  out[0] = c.stiffness[0] * x[0];
+  for (int k = 1; k < CD; k++) {
+    out[0] += c.stiffness[k] * x[k];
+    if (ELLIPTIC) along += c.stiffness[COUPLING] * c.stiffness[k] * x[k];
+  }
+  for (int k = 1; k < CD; k++) out[k] = c.stiffness[k] * along + c.stiffness[CD - 1 + k] * x[k];
+}
 
 // Calls do_edge(friction, k, sign) for the edges of a contact's pyramid; k is 0 for its only row.
 template <class F> DEV void each_edge(const Model& M, const Contact& c, F do_edge) {
@@ -40,10 +51,11 @@ template <class F> DEV void each_edge(const Model& M, const Contact& c, F do_edg
     }
   }
 }
-// Finds the forces and the stiffness of the edges that push (mj_constraintUpdate).
+// Finds the forces and the stiffness of the rows that push (mj_constraintUpdate).
 DEV void push(const Model& M, Contact& c) {
   for (int k = 0; k < CD; k++) c.force[k] = 0;
-  for (int k = 0; k < 2 * CD - 1; k++) c.stiffness[k] = 0;
+  for (int k = 0; k <= COUPLING; k++) c.stiffness[k] = 0;
+  if (ELLIPTIC && M.kind_dim[M.item_kind[c.item]] > 1) return push_cone(M, c);
   each_edge(M, c, [&](real friction, int k, real) {
     const real residual = c.residual[0] + friction * c.residual[k];
     const real active_mass = residual < 0 ? c.constraint_mass : real(0);
@@ -58,8 +70,9 @@ DEV void push(const Model& M, Contact& c) {
   });
 }
 
-// What a contact's edges add to the derivative of the cost at a length along the step (PrimalEval).
+// What a contact's rows add to the derivative of the cost at a length along the step (PrimalEval).
 DEV void bend(const Model& M, const Contact& c, real length, Bend& sum) {
+  if (ELLIPTIC && M.kind_dim[M.item_kind[c.item]] > 1) return bend_cone(M, c, length, sum);
   each_edge(M, c, [&](real friction, int k, real) {
     const real residual = c.residual[0] + (k ? friction * c.residual[k] : real(0));
     const real change = c.change[0] + (k ? friction * c.change[k] : real(0));

@@ -93,13 +93,7 @@ DEV void add_rows(const Team& t, const Model& M, State& s, real (&h)[ROWS_A_LANE
     // J' stiffness J, where stiffness has a first row and column and a diagonal: the edges of the
     // pyramid couple the normal with each tangent, and no tangent with another one.
     real weight[ROWS_A_LANE][CD];
-    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
-      weight[r][0] = c.stiffness[0] * entries[r][0];
-      for (int k = 1; k < CD; k++) {
-        weight[r][0] += c.stiffness[k] * entries[r][k];
-        weight[r][k] = c.stiffness[k] * entries[r][0] + c.stiffness[CD - 1 + k] * entries[r][k];
-      }
-    }
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) stiffness_times(c, entries[r], weight[r]);
     UNROLL for (int k = 0; k < CD; k++) {
       if (k >= dim) break;
       UNROLL for (int q = 0; q < SIDE; q += 4) {
@@ -195,11 +189,7 @@ DEV void follow(const Team& t, const Model& M, State& s, Search& search, real le
   all_contacts(t, s, [&](const Contact& c) {
     if (c.stiffness[0] == 0) return;
     real force[CD];
-    force[0] = c.stiffness[0] * c.change[0];
-    for (int k = 1; k < CD; k++) {
-      force[0] += c.stiffness[k] * c.change[k];
-      force[k] = c.stiffness[k] * c.change[0] + c.stiffness[CD - 1 + k] * c.change[k];
-    }
+    stiffness_times(c, c.change, force);
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
       const int i = t.lane + r * W;
       real moves[CD];

@@ -35,16 +35,18 @@ DEV constexpr bool reports(int fields) { return (REPORTS) & fields; }
 // The numbers of all bodies, if one of the fields is reported.
 DEV constexpr int room(int fields, int numbers) { return reports(fields) ? numbers * NB : 1; }
 
-// A contact's rows are the edges n + mu t and n - mu t of a pyramid; here they are in the basis of
-// the normal, the tangents and, from condim 4 on, turning about these.
+// A contact's rows are those of an elliptic cone, or the edges n + mu t and n - mu t of a pyramid;
+// here they are in the basis of the normal, the tangents and, from condim 4 on, turning about these.
+constexpr int COUPLING = 2 * CD - 2 + ELLIPTIC;
 struct Contact {
   real at[3];               // from the point of reference (m)
   real frame[9];            // normal, two tangents
   real residual[CD];        // J qacc - reference
   real change[CD];          // J direction
-  real force[CD];           // of the edges that push
-  real stiffness[2 * CD - 1];  // of the same: normal, each tangent with the normal, with itself
-  real constraint_mass;     // MuJoCo's D
+  real force[CD];           // of the rows that push
+  // Of the same: normal, each tangent with the normal, with itself; of a cone also the coupling.
+  real stiffness[2 * CD - 1 + ELLIPTIC];
+  real constraint_mass;     // MuJoCo's D, of the normal
   int item;
 };
 
