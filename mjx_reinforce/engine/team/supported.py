@@ -9,6 +9,7 @@ import numpy as np
 from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.physics.early_stop import stops_early
 from mjx_reinforce.engine.physics.mjx_internals import geom_pairs
+from mjx_reinforce.engine.team import flags
 
 _C: Any = mujoco  # a C extension without stubs
 #: MuJoCo's mjtJoint.
@@ -51,7 +52,7 @@ class GeomPair(NamedTuple):
 
 def why(mj_model: MjModel) -> str | None:
     """Returns in one line why teams cannot play a model, or None if they can."""
-    model: Any = mj_model
+    model = flags.without_disabled(mj_model)
     for features in (_lacking_options, _lacking_parts, _lacking_actuators, _lacking_contacts):
         for feature, has_feature in features(model):
             if has_feature:
@@ -68,8 +69,7 @@ def _lacking_options(model: Any) -> Iterable[tuple[str, Any]]:
     yield "a solver other than Newton", opt.solver != _C.mjtSolver.mjSOL_NEWTON
     limits = f"few iterations of its solver ({opt.iterations}, {opt.ls_iterations} along a line)"
     yield limits, stops_early(model)
-    flags = opt.disableflags | opt.enableflags | opt.disableactuator
-    yield "flags that disable or enable parts of the physics", flags
+    yield "flags that enable parts of the physics", flags.enabled_physics(model)
     yield "noslip iterations", opt.noslip_iterations
     yield "a medium with density or viscosity", opt.density or opt.viscosity
 
@@ -144,6 +144,8 @@ def geom_kinds(model: Any, pair: GeomPair) -> tuple[int, int]:
 
 def meeting(model: Any) -> list[GeomPair]:
     """Returns the pairs of geoms that may meet, the flatter first; those of C's choice lead."""
+    if not flags.has_contacts(model):
+        return []
     pair_keys = ((int(pair), *sorted((int(g), int(h)))) for g, h, pair in geom_pairs(model))
     pairs = []
     for pair, *geoms in sorted(pair_keys):

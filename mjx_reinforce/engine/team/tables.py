@@ -14,7 +14,7 @@ import numpy as np
 
 from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.scalar import UnsupportedPrimitive
-from mjx_reinforce.engine.team import records, supported
+from mjx_reinforce.engine.team import flags, records, supported
 from mjx_reinforce.engine.team.frames import Frame, Inertial, rotation, six, times
 from mjx_reinforce.engine.team.records import Softness
 from mjx_reinforce.engine.team.supported import BALL, BOX, CAPSULE, FREE, HINGE, PLANE, SLIDE, why
@@ -113,7 +113,7 @@ class _Tables:
 
     def __init__(self, mj_model: MjModel, num_near: int):
         """Makes them; see ``physics_text``."""
-        model: Any = mj_model
+        model = flags.without_disabled(mj_model)
         self.model = model
         self.constants: dict[str, int] = {}
         self.functions: dict[str, Iterable[int]] = {}
@@ -187,7 +187,8 @@ class _Tables:
         if opt.integrator == _C.mjtIntegrator.mjINT_IMPLICITFAST:
             return 2
         is_euler = opt.integrator == _C.mjtIntegrator.mjINT_EULER
-        return int(is_euler and self.model.dof_damping.any())
+        is_implicit = is_euler and not flags.is_off(self.model, "eulerdamp")
+        return int(is_implicit and self.model.dof_damping.any())
 
     def _records(self, name: str, order: Any = slice(None), **columns: np.ndarray) -> None:
         """Makes a table of structs from the columns of their fields, [rows] or [rows, numbers]."""
@@ -367,7 +368,7 @@ class _Tables:
         imp = np.array(solimp, float)
         if (ref[0] > 0) != (ref[1] > 0):
             ref = np.array([0.02, 1])
-        if ref[0] > 0:
+        if ref[0] > 0 and not flags.is_off(self.model, "refsafe"):
             ref[0] = max(ref[0], 2 * self.model.opt.timestep)
         dmin, dmax, midpoint = np.clip(imp[[0, 1, 3]], _MIN_IMPEDANCE, _MAX_IMPEDANCE)
         width = max(imp[2], 0)
