@@ -10,6 +10,7 @@ import functools
 import hashlib
 import importlib.util
 import json
+import logging
 import os
 import re
 import shutil
@@ -31,6 +32,7 @@ TRIPLE = "nvptx64-nvidia-cuda"
 _VERSION = r"\.version (\d+\.\d+)"
 #: What GPUs of compute capability 7.0 need. For one that it does not know, LLVM writes 3.2.
 _LEAST_VERSION = 6.0
+_LOG = logging.getLogger(__name__)
 _CACHE: dict[str, "Kernel"] = {}
 _LOCK = threading.Lock()
 
@@ -192,13 +194,18 @@ def fill(slot: int, kernel: Kernel, assemblers: Sequence[Assembler], folder: Pat
     """
     cuda = ctypes.CDLL("libcuda.so.1")
     handle = ctypes.c_void_p()
+    failures = []
     for assembler in assemblers:
         try:
             image = _machine_code(kernel, assembler, folder)
             handle = _in_memory(cuda, image, kernel.launch.shared)
             break
         except Exception as error:  # whatever an assembler or a driver raises
-            objects.describe(kernel.key, f"not by {assembler.name}: {error}")
+            failures.append(f"not by {assembler.name}: {error}")
+            objects.describe(kernel.key, failures[-1])
+    if not handle:
+        # The launch that fails can only say a number.
+        _LOG.error("nothing assembles a kernel for this GPU: %s", "; ".join(failures)[:2000])
     launch = ctypes.cast(cuda.cuLaunchKernel, ctypes.c_void_p)
     _SLOT_VALUES.append((ctypes.c_void_p * 3)(launch, handle, kernel.launch.shared))
     # Last of all, as a launch in another thread reads all three once the slot is not null.

@@ -132,8 +132,8 @@ def test_what_the_driver_does_not_launch_is_an_error(driver):
         launched("is_an_error", 2)
 
 
-def test_the_next_assembler_is_tried(driver, monkeypatch, capfd):
-    """Where none can, the driver is asked to launch nothing, which it refuses."""
+def test_the_next_assembler_is_tried(driver, monkeypatch, capfd, caplog):
+    """Where none can, the driver is asked to launch nothing, which it refuses, and the log says why."""
     driver.refused = (b"of another GPU",)
     monkeypatch.setenv(objects.DEBUG, "1")
     slot = POINTER()
@@ -148,6 +148,7 @@ def test_the_next_assembler_is_tried(driver, monkeypatch, capfd):
         launch, found = (POINTER * 2).from_address(slot.value)
         assert launch == ctypes.cast(driver.cuLaunchKernel, POINTER).value
         assert found == kernel
+        assert ("nothing assembles" in caplog.text) == (kernel is None)
         said = capfd.readouterr().err
         if driver.images == [b"new"]:
             assert re.search(rf"kernel {KERNEL.key}: new took 0.\d\d s: Used 8 registers\n", said)
