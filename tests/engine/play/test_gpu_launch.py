@@ -133,7 +133,7 @@ def test_what_the_driver_does_not_launch_is_an_error(driver):
 
 
 def test_the_next_assembler_is_tried(driver, monkeypatch, capfd, caplog):
-    """Where none can, the driver is asked to launch nothing, which it refuses, and the log says why."""
+    """Where none can, the log says why; the driver refuses to launch nothing."""
     driver.refused = (b"of another GPU",)
     monkeypatch.setenv(objects.DEBUG, "1")
     slot = POINTER()
