@@ -153,14 +153,14 @@ class _Tables:
         lines.append("struct Model {")
         lines.append("  real timestep, smallest_gain;")
         # In float32 a step that lowers the cost by less is rounding; in float64 the search goes on
-        # until no row changes.
-        gain = 1e-10 * self.model.stat.meaninertia * self.model.nv
-        # The cost of an elliptic cone that slides is not quadratic: no step is the last by itself.
-        # Newton's method squares the error, so that after a step of such a gain nothing is left.
-        exact_gain = 1e-10 * gain if self._is_elliptic() else 0
+        # until no row changes. The cost of an elliptic cone that slides is not quadratic, and no
+        # step is the last by itself: in float32 one of a tenth of C's tolerance is, in float64 one
+        # whose square is rounding, as Newton's method squares what is left.
+        single, double = (2e-9, 1e-20) if self._is_elliptic() else (1e-10, 0.0)
+        scale = float(self.model.stat.meaninertia * self.model.nv)
         initial_values = [
             f"real({float(self.model.opt.timestep)!r})",
-            f"SINGLE ? real({float(gain)!r}) : real({float(exact_gain)!r})",
+            f"SINGLE ? real({single * scale!r}) : real({double * scale!r})",
         ]
         for type_name, literal, arrays in (
             ("int", lambda x: f"{int(x):d}", self.ints),
