@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from mjx_reinforce.engine.base import MjModel
+from mjx_reinforce.engine.physics.early_stop import stops_early
 from mjx_reinforce.engine.scalar import UnsupportedPrimitive
 from mjx_reinforce.engine.team import flags, records, supported
 from mjx_reinforce.engine.team.frames import Frame, Inertial, rotation, six, times
@@ -38,6 +39,7 @@ _HEADERS = [
     "equality",
     "elimination",
     "newton",
+    "early_stop",
     "report",
     "integrators",
     "scalar",
@@ -105,7 +107,7 @@ def far_words(mj_model: MjModel, num_near: int = NUM_NEAR) -> int:
 class _Tables:
     """The tables of one model.
 
-    constants: numbers that the compiler knows, such as sizes of arrays
+    constants, real_constants: numbers that the compiler knows, such as sizes of arrays
     functions: tables that the compiler knows, for loops that it writes out
     ints, masks, reals: the arrays of the struct Model, which the lanes read
     soft: the rows of the softnesses that were met, with their numbers
@@ -116,6 +118,7 @@ class _Tables:
         model = flags.without_disabled(mj_model)
         self.model = model
         self.constants: dict[str, int] = {}
+        self.real_constants: dict[str, float] = {}
         self.functions: dict[str, Iterable[int]] = {}
         self.ints: dict[str, Any] = {}
         self.masks: dict[str, Any] = {}
@@ -129,6 +132,7 @@ class _Tables:
         self._equalities()
         self._pairs(num_near)
         self._jumps()
+        self._search()
         self.constants["NQ"] = model.nq
         self.constants["NV"] = model.nv
         self.constants["NL"] = model.njnt
@@ -144,6 +148,9 @@ class _Tables:
     def text(self) -> str:
         """Returns the tables as C++."""
         lines = [f"constexpr int {name} = {int(x)};" for name, x in self.constants.items()]
+        lines += [
+            f"constexpr real {name} = real({x!r});" for name, x in self.real_constants.items()
+        ]
         mask = "unsigned long long" if self.model.nv > 32 else "unsigned"
         lines.append(f"typedef {mask} Mask;")
         for name, values in self.functions.items():
@@ -177,6 +184,18 @@ class _Tables:
         lines += records.checks()
         lines.append("#define MODEL_INIT {" + ",\\\n".join(initial_values) + "}")
         return "\n".join(lines)
+
+    def _search(self) -> None:
+        """Makes the numbers of the constraint solver that are C's own."""
+        model = self.model
+        self.constants["STOPS_EARLY"] = stops_early(model)
+        self.constants["STEPS"] = model.opt.iterations
+        self.constants["LENGTHS"] = model.opt.ls_iterations
+        self.constants["WARM"] = not flags.is_off(model, "warmstart")
+        self.constants["ONE_ISLAND"] = flags.is_off(model, "island")
+        self.real_constants["TOLERANCE"] = float(model.opt.tolerance)
+        self.real_constants["LENGTH_TOLERANCE"] = float(model.opt.ls_tolerance)
+        self.real_constants["MEAN_TRACE"] = float(model.stat.meaninertia * model.nv)
 
     def _is_elliptic(self) -> bool:
         return self.model.opt.cone == _C.mjtCone.mjCONE_ELLIPTIC

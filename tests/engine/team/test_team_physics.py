@@ -115,7 +115,7 @@ def _error(m: Any, play: Any, data: Any, skip: int) -> float:
 
 def _largest_error(m: Any, folder: Any, skip: int, starts: int, near=tables.NUM_NEAR, lanes=1):
     """Returns the largest error of steps along short episodes of random play."""
-    play = _compiled(_exact(m), folder, near, lanes)
+    play = _compiled(m, folder, near, lanes)
     rng, errors = np.random.default_rng(0), []
     for _ in range(starts):
         data = _C.MjData(m)
@@ -133,7 +133,7 @@ def _largest_error(m: Any, folder: Any, skip: int, starts: int, near=tables.NUM_
 @pytest.mark.parametrize("task", ["half_cheetah", "ant", "humanoid", "humanoid_standup", _OWN])
 def test_tasks(task, tmp_path):
     m = models.load_model(f"{task}.xml")
-    assert _largest_error(m, tmp_path, skip=5, starts=2) < 1e-9
+    assert _largest_error(_exact(m), tmp_path, skip=5, starts=2) < 1e-9
 
 
 @needs_compiler
@@ -141,7 +141,7 @@ def test_tasks(task, tmp_path):
 @pytest.mark.parametrize("lanes", [1, 8])
 def test_contacts_that_do_not_fit_are_kept(lanes, tmp_path):
     m = models.load_model("humanoid_standup.xml")
-    assert _largest_error(m, tmp_path, skip=2, starts=1, near=1, lanes=lanes) < 1e-9
+    assert _largest_error(_exact(m), tmp_path, skip=2, starts=1, near=1, lanes=lanes) < 1e-9
 
 
 @needs_compiler
@@ -149,14 +149,31 @@ def test_contacts_that_do_not_fit_are_kept(lanes, tmp_path):
 @pytest.mark.parametrize(("task", "lanes"), [("half_cheetah", 16), ("ant", 16), ("humanoid", 32)])
 def test_lanes_in_any_order_play_alike(task, lanes, tmp_path):
     m = models.load_model(f"{task}.xml")
-    assert _largest_error(m, tmp_path, skip=2, starts=1, lanes=lanes) < 1e-9
+    assert _largest_error(_exact(m), tmp_path, skip=2, starts=1, lanes=lanes) < 1e-9
 
 
 @needs_compiler
 @pytest.mark.parametrize("feature", _MODELS["features"])
 def test_features(feature, tmp_path):
     m = _model(**_MODELS["features"][feature])
+    assert _largest_error(_exact(m), tmp_path, skip=3, starts=3) < 1e-9
+
+
+@needs_compiler
+@pytest.mark.parametrize("limits", _MODELS["early"])
+def test_a_search_that_stops_early_ends_where_c_ends(limits, tmp_path):
+    m = _model(**_MODELS["early"][limits])
     assert _largest_error(m, tmp_path, skip=3, starts=3) < 1e-9
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_a_quadruped_that_takes_few_steps(cone, tmp_path):
+    spec = _C.MjSpec.from_file(f"{_OWN}.xml")
+    spec.option.cone = getattr(_C.mjtCone, f"mjCONE_{cone.upper()}")
+    spec.option.iterations, spec.option.ls_iterations = 2, 5
+    assert _largest_error(spec.compile(), tmp_path, skip=2, starts=2, lanes=8) < 1e-9
 
 
 @needs_compiler
@@ -204,4 +221,4 @@ def test_a_model_that_is_not_covered_has_no_device_code():
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as made:
         task = models.load_model(f"{sys.argv[1]}.xml")
-        print(_largest_error(task, Path(made), skip=5, starts=int(sys.argv[2]) // 10))
+        print(_largest_error(_exact(task), Path(made), skip=5, starts=int(sys.argv[2]) // 10))

@@ -59,6 +59,15 @@ struct Bounds {
     push(qacc, gradient, sum);
     return sum;
   }
+  // Adds what the rows cost along a step (see early_stop.h).
+  template <class Sum> DEV void work(real qacc, real direction, Sum& sum) const {
+    for (int n = 0; n < LIMITS; n++)
+      if (limit_constraint_mass[n] > 0)
+        sum.add_one_sided(limit_constraint_mass[n], limit_sign[n] * qacc - limit_reference[n],
+                          limit_sign[n] * direction);
+    if (LOSSES && loss_constraint_mass > 0)
+      sum.add_bounded(loss_constraint_mass, loss, qacc - loss_reference, direction);
+  }
   DEV void bend(real qacc, real direction, real length, Bend& sum) const {
     for (int n = 0; n < LIMITS; n++)
       if (limit_constraint_mass[n] > 0)

@@ -18,7 +18,7 @@ DEV int forward(const Team& team, const Model& M, State& s) {
   if (NE) general_rows(t, M, s);
   forces_and_inertia(t, M, s);
   collide(t, M, s);
-  return newton(t, M, s);
+  return STOPS_EARLY ? newton_as_c(t, M, s) : newton(t, M, s);
 }
 
 // Moves positions, from start on, by a velocity for a time (mj_integratePos).

@@ -1,0 +1,242 @@
+// The solver of models that allow it few steps, or few lengths of one: what C answers is where its
+// search happened to be, so that this is C's own search (mj_solNewton; in JAX physics/early_stop.py).
+#pragma once
+
+// A length of a step, and there the cost above that at length 0, with its derivatives.
+struct Mark {
+  real length, cost, slope, curvature;
+  // Where the slope would be zero if no row changed.
+  DEV real next() const { return length - slope / curvature; }
+};
+
+// Rows of one lane along a step.
+struct Work {
+  real length;
+  real cost = 0, slope = 0, curvature = 0;
+  // A row whose force is linear from `then` to `now`, or zero at one of them.
+  DEV void add(real mass, real then, real change, bool pushed, bool pushes) {
+    const real now = then + length * change;
+    // The difference of two costs has no digits where a row stays what it is; its mean force has.
+    cost += pushed && pushes ? mass * length * change * (then + now) / 2
+                             : mass * ((pushes ? now * now : 0) - (pushed ? then * then : 0)) / 2;
+    if (pushes) {
+      slope += mass * now * change;
+      curvature += mass * change * change;
+    }
+  }
+  DEV void add_one_sided(real mass, real residual, real change) {
+    add(mass, residual, change, residual < 0, residual + length * change < 0);
+  }
+  // A row of friction loss: beyond its reach the force is at its bound.
+  DEV void add_bounded(real mass, real bound, real residual, real change) {
+    const real reach = bound / mass, now = residual + length * change;
+    const bool was_linear = fabs(residual) < reach, is_linear = fabs(now) < reach;
+    add(mass, residual, change, was_linear, is_linear);
+    const real sign = now < 0 ? real(-1) : real(1);
+    if (!was_linear && !is_linear && residual * now > 0) {
+      cost += bound * sign * length * change;
+    } else {
+      if (!was_linear) cost -= bound * (fabs(residual) - reach / 2);
+      if (!is_linear) cost += bound * (fabs(now) - reach / 2);
+    }
+    if (!is_linear) slope += bound * sign * change;
+  }
+};
+
+DEV void add_contact(const Model& M, const Contact& c, Work& sum) {
+  if (ELLIPTIC && M.kind_dim[M.item_kind[c.item]] > 1) {
+    const ConeCost end = cone_cost(M, c, sum.length);
+    sum.cost += end.cost - cone_cost(M, c, 0).cost;
+    sum.slope += end.slope;
+    sum.curvature += end.curvature;
+    return;
+  }
+  each_edge(M, c, [&](real friction, int k, real) {
+    const real residual = c.residual[0] + (k ? friction * c.residual[k] : real(0));
+    const real change = c.change[0] + (k ? friction * c.change[k] : real(0));
+    sum.add_one_sided(c.constraint_mass, residual, change);
+  });
+}
+
+// A step of the search: its slope and curvature without rows.
+struct Step { real slope, curvature; };
+
+DEV Mark mark_at(const Team& t, const Model& M, State& s, const Search& search, const Step& step,
+                 real length) {
+  const int lane = t.lane;
+  Work sum = {length};
+  each_contact(t, s, [&](Contact& c) { add_contact(M, c, sum); });
+  UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
+    search.bounds[r].work(search.qacc[r], search.direction[r], sum);
+  EACH(e, NE)
+    sum.add(s.general_constraint_mass[e], s.general_residual[e], s.general_change[e], true, true);
+  const real curvature = step.curvature + t.sum(sum.curvature);
+  return {length, length * (step.slope + length * step.curvature / 2) + t.sum(sum.cost),
+          step.slope + length * step.curvature + t.sum(sum.slope),
+          curvature > 0 ? curvature : real(1e-15)};
+}
+
+// Where C's line search (PrimalSearch) ends: Newton steps along the line until the slope changes
+// its sign, then both ends of that interval move inwards.
+DEV Mark line_as_c(const Team& t, const Model& M, State& s, const Search& search, const Step& step,
+                   real small) {
+  const auto at = [&](real length) { return mark_at(t, M, s, search, step, length); };
+  Mark high = at(0), low = at(high.next());
+  const real sign = low.slope < 0 ? real(1) : real(-1);
+  if (fabs(low.slope) < small && (low.length == 0 || low.cost < 0)) return low;
+  int lengths = 2;
+  LOOP while (low.slope * sign <= -small && lengths < LENGTHS) {
+    high = low;
+    low = at(low.next());
+    lengths++;
+    if (fabs(low.slope) < small && low.cost < 0) return low;
+  }
+  if (lengths >= LENGTHS) return low;
+  Mark ends[2] = {low, high}, roots[2] = {at(low.next()), low};
+  LOOP for (lengths++; lengths < LENGTHS; lengths++) {
+    const Mark middle = at((ends[0].length + ends[1].length) / 2);
+    const Mark candidates[3] = {roots[0], roots[1], middle};
+    const Mark* best = nullptr;
+    for (const Mark& mark : candidates)
+      if (fabs(mark.slope) < small && (!best || mark.cost < best->cost)) best = &mark;
+    if (best) return *best;
+    // Each end goes to the candidate on its side of the root that is nearest (updateBracket).
+    bool moved = false;
+    for (int k = 0; k < 2; k++) {
+      const real slope = ends[k].slope;
+      for (const Mark& mark : candidates)
+        if (mark.slope * ends[k].slope > 0 && fabs(mark.slope) < fabs(ends[k].slope))
+          ends[k] = mark;
+      if (ends[k].slope == slope) continue;
+      roots[k] = at(ends[k].next());
+      lengths++;
+      moved = true;
+    }
+    if (!moved) return middle;
+  }
+  const Mark& end = ends[0].cost <= ends[1].cost ? ends[0] : ends[1];
+  return end.cost < 0 ? end : Mark{0, 0, 0, 0};
+}
+
+// M times s.direction: below the diagonal of s.rows is M.
+DEV void inertia_times_direction(const Team& t, const State& s, const Search& search,
+                                 real (&out)[ROWS_A_LANE]) {
+  UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+    const int i = t.lane + r * W;
+    out[r] = search.diagonal[r] * search.direction[r];
+    for (int j = 0; j < NV && i < NV; j++) {
+      const int row = j < i ? i : j, column = j < i ? j : i;
+      if (j != i) out[r] += s.rows[row][column / 4].x[column % 4] * s.direction[j / 4].x[j % 4];
+    }
+  }
+}
+
+// Subtracts the forces of contacts and general rows from the gradient.
+DEV void subtract_forces(const Team& t, const Model& M, State& s, real (&gradient)[ROWS_A_LANE]) {
+  all_contacts(t, s, [&](const Contact& c) {
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+      const int i = t.lane + r * W;
+      real moves[CD];
+      if (i < NV) {
+        basis(M, s, c, i, moves);
+        for (int k = 0; k < CD; k++) gradient[r] -= moves[k] * c.force[k];
+      }
+    }
+  });
+  for (int e = 0; e < NE; e++)
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+      const int i = t.lane + r * W;
+      if (i < NV)
+        gradient[r] += s.general[e][i / 4].x[i % 4] * s.general_constraint_mass[e] *
+                       s.general_residual[e];
+    }
+}
+
+// As begin_step. A search that stops early leaves a gradient, of which implicit damping takes part.
+DEV void begin_step_as_c(const Team& t, const Model& M, State& s, Search& search, bool starts,
+                         bool damps) {
+  UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+    const int i = t.lane + r * W;
+    real stiffness = 0;
+    search.gradient[r] = search.imbalance[r];
+    if (!starts) search.bounds[r].push(search.qacc[r], search.gradient[r], stiffness);
+    if (damps) {
+      stiffness = i < NV ? M.timestep * s.drag[i] : real(0);
+      search.gradient[r] += stiffness * search.qacc[r];
+    }
+    if (i < NV) s.rows[i][i / 4].x[i % 4] = search.diagonal[r] + stiffness;
+  }
+}
+
+// Replaces newton, and returns as that.
+DEV int newton_as_c(const Team& t, const Model& M, State& s) {
+  const int lane = t.lane;
+  Search search(t, M, s);
+  real trace = 0, improvement = 0;
+  UNROLL for (int r = 0; r < ROWS_A_LANE; r++) trace += search.diagonal[r];
+  trace = t.sum(trace);
+  const real scale = 1 / (ONE_ISLAND ? MEAN_TRACE : trace);
+  bool settled = false;
+  int steps = -1;  // the first goes to the acceleration without rows, if that costs less
+  LOOP for (;; steps++) {
+    const bool starts = steps < 0, damps = IMPLICIT && settled;
+    real h[ROWS_A_LANE][SIDE];
+    begin_step_as_c(t, M, s, search, starts, damps);
+    if (!starts) each_contact(t, s, [&](Contact& c) { push(M, c); });
+    t.sync();
+    load_rows(t, s, h);
+    if (damps) {
+      subtract_forces(t, M, s, search.gradient);
+    } else if (!starts) {
+      add_rows(t, M, s, h, search.gradient);
+    }
+    load_right_side(t, s, search, h);
+    solve(t, s, h, search.direction);
+    if (damps) break;
+    change_along(t, M, s);
+    t.sync();
+    real inertia[ROWS_A_LANE], slope = 0, curvature = 0, square = 0, norm = 0, along = 0;
+    inertia_times_direction(t, s, search, inertia);
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+      slope += search.direction[r] * search.imbalance[r];
+      curvature += search.direction[r] * inertia[r];
+      square += search.gradient[r] * search.gradient[r];
+      norm += search.direction[r] * search.direction[r];
+      along += search.gradient[r] * search.direction[r];
+    }
+    const Step step = {t.sum(slope), t.sum(curvature)};
+    norm = root(t.sum(norm));
+    Mark mark;
+    if (starts) {
+      mark = mark_at(t, M, s, search, step, 1);
+      if (WARM && !(mark.cost < 0)) mark.length = 0;
+    } else {
+      const bool flat = scale * root(t.sum(square)) < TOLERANCE;
+      const bool low = -scale * t.sum(along) / 2 < TOLERANCE;
+      const bool slow = scale * improvement > 0 && scale * improvement < TOLERANCE;
+      settled = steps == 0 ? flat && low : flat || low || slow;
+      mark = {0, 0, 0, 0};
+      if (!settled && norm >= real(1e-15)) {
+        const real small = TOLERANCE * LENGTH_TOLERANCE * norm / scale;
+        mark = line_as_c(t, M, s, search, step, small);
+      }
+      settled |= mark.length == 0 || steps + 1 >= STEPS;
+      improvement = -mark.cost;
+    }
+    t.sync();
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+      search.qacc[r] += mark.length * search.direction[r];
+      search.imbalance[r] += mark.length * inertia[r];
+    }
+    each_contact(t, s, [&](Contact& c) {
+      for (int k = 0; k < CD; k++) c.residual[k] += mark.length * c.change[k];
+    });
+    EACH(e, NE) s.general_residual[e] += mark.length * s.general_change[e];
+    t.sync();
+    if (settled && !IMPLICIT) break;
+  }
+  UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
+    if (lane + r * W < NV) s.qacc_warmstart[lane + r * W] = search.qacc[r];
+  t.sync();
+  return steps + 1;
+}
