@@ -148,9 +148,8 @@ class _Tables:
     def text(self) -> str:
         """Returns the tables as C++."""
         lines = [f"constexpr int {name} = {int(x)};" for name, x in self.constants.items()]
-        lines += [
-            f"constexpr real {name} = real({x!r});" for name, x in self.real_constants.items()
-        ]
+        # Not constexpr: a constant of floats would be a symbol of the machine code.
+        lines += [f"#define {name} real({x!r})" for name, x in self.real_constants.items()]
         mask = "unsigned long long" if self.model.nv > 32 else "unsigned"
         lines.append(f"typedef {mask} Mask;")
         for name, values in self.functions.items():
