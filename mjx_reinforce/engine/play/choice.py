@@ -89,7 +89,7 @@ def choose(
     def engine_in_c(task: Environment, reason: str) -> Engine:
         return Engine("mujoco", reason, _rollout_in_c(task), time.perf_counter() - start_time)
 
-    in_c = _in_c_mujoco(name, env)
+    in_c = None if teams_may_play(name, env) else _in_c_mujoco(name, env)
     if in_c is not None:
         return engine_in_c(*in_c)
 
@@ -109,6 +109,12 @@ def choose(
     if engine_name == "native" and available.platform() == "gpu":
         reason += f", {team.played_by(env)}"
     return Engine(engine_name, reason, rollout, time.perf_counter() - start_time)
+
+
+def teams_may_play(name: str, env: Environment) -> bool:
+    """Returns whether an engine of this name lets teams of lanes try, also what MJX refuses."""
+    is_here = name in ("auto", "native") and available.platform() == "gpu"
+    return is_here and not available.unavailable() and team.why_not(env) is None
 
 
 def _in_c_mujoco(name: str, env: Environment) -> tuple[Environment, str] | None:
@@ -141,9 +147,11 @@ def instead_of_vmap(env: Environment, reason: str) -> tuple[Environment, str] | 
     """Returns what C MuJoCo plays where machine code cannot hold an env step, and the reason.
 
     On a CPU, XLA then compiles for minutes, and plays such a model slower than C MuJoCo
-    (docs/decisions.md). None on other devices, and where there is no machine code for anything.
+    (docs/decisions.md). None where there is no machine code for anything and, on other devices, for
+    models that C MuJoCo does not play best.
     """
-    if available.platform() != "cpu" or available.unavailable():
+    is_best = c_mujoco.why_best(env) is not None
+    if not is_best and (available.platform() != "cpu" or available.unavailable()):
         return None
     task = c_mujoco.played_by_c(env)
     if isinstance(task, str):

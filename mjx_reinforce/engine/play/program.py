@@ -19,7 +19,7 @@ from mjx_reinforce.engine.gpu import kernel as gpu_kernel
 from mjx_reinforce.engine.gpu import ptx, team_kernel
 from mjx_reinforce.engine.gpu import seam as gpu_seam
 from mjx_reinforce.engine.gpu.source import Source
-from mjx_reinforce.engine.play import available
+from mjx_reinforce.engine.play import available, c_mujoco
 from mjx_reinforce.engine.play import teams as team
 from mjx_reinforce.engine.play.counter import at_counter, split
 from mjx_reinforce.engine.scalar import jaxprs, scalarized
@@ -216,6 +216,8 @@ def load(
         team_kernel_and_shapes = _by_teams(job, env, function, examples, writers)
         if team_kernel_and_shapes is not None:
             return team_kernel_and_shapes
+        if env is not None and c_mujoco.why_best(env) is not None:
+            raise scalar.UnsupportedPrimitive("a thread of a GPU plays it slower than C MuJoCo")
         unrolled = _GPU_SCANS
     program, shapes = scalarized.trace(function, *examples, unrolled=unrolled)
     source = f"{job} {jaxprs.fingerprint(program)} {objects.source_digest(*_WRITERS)}"

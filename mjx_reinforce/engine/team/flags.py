@@ -9,8 +9,8 @@ import numpy as np
 from mjx_reinforce.engine.base import MjModel
 
 _C: Any = mujoco
-_DISABLED = _C.mjtDisableBit
-_ENABLED = _C.mjtEnableBit
+_DISABLED: Any = _C.mjtDisableBit
+_ENABLED: Any = _C.mjtEnableBit
 #: Flags of <option> that disable terms, and the fields that are zero without these.
 _TERMS = {
     "equality": ("eq_active0",),

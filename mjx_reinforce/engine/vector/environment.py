@@ -35,6 +35,7 @@ from mjx_reinforce.engine.play.choice import (
     environment_of,
     instead_of_vmap,
     map_function,
+    teams_may_play,
 )
 from mjx_reinforce.engine.play.counter import key_of_words
 
@@ -251,7 +252,9 @@ class VectorEnv:
         dtype = jnp.result_type(float) if zeros.ndim else zeros.dtype
         self._null_action = np.asarray(zeros, dtype)
         self.action_size = env.action_size
-        self.engine = self._engine(engine, *environment_of(engine, env))
+        is_for_teams = teams_may_play(engine, env)
+        task, reason = (env, None) if is_for_teams else environment_of(engine, env)
+        self.engine = self._engine(engine, task, reason)
         if engine == "auto" and self.engine.name == "vmap":
             in_c = instead_of_vmap(env, self.engine.why)
             if in_c is not None:

@@ -5,15 +5,17 @@ import re
 import gpu_on_cpu
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from players import actor_and_act, only_active, played
 
 from mjx_reinforce import envs, make_vec
 from mjx_reinforce.engine.gpu import nvrtc, ptx, team_kernel
-from mjx_reinforce.engine.play import available, native, program
+from mjx_reinforce.engine.play import available, choice, native, program
 from mjx_reinforce.engine.play import teams as team
 from mjx_reinforce.engine.scalar import scalarized
+from mjx_reinforce.envs.base import MujocoEnv
 
 if reason := available.unavailable():
     pytest.skip(reason, allow_module_level=True)
@@ -89,3 +91,50 @@ def test_teams_step_environments_side_by_side(teams):
             found[-1] = vec.step(found[-1], action)
     assert {kernel.launch.lanes for kernel in made} == {16}
     np.testing.assert_allclose(*[state.obs for state in found], rtol=2e-3, atol=2e-3)
+
+
+class _Box(MujocoEnv):
+    """A box that slides over the floor."""
+
+    def __init__(self, flags):
+        geom = '<geom type="box" size=".1 .08 .06"/>'
+        xml = f"""
+        <mujoco>
+          <option cone="elliptic" timestep=".004">{flags}</option>
+          <worldbody>
+            <geom type="plane" size="5 5 .1"/>
+            <body pos="0 0 .06">
+              <joint name="x" type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>
+              <joint type="hinge" axis="0 1 0" stiffness="1"/>{geom}
+            </body>
+          </worldbody>
+          <actuator><motor joint="x" gear="90"/></actuator>
+        </mujoco>"""
+        spec = mujoco.MjSpec.from_string(xml)
+        super().__init__(xml_file=spec, frame_skip=2, max_episode_steps=30, reward_threshold=None)
+
+    def initial(self, rng):
+        return jnp.zeros(3), 0.3 * jax.random.normal(rng, (3,))
+
+    def outcome(self, before, data, action):
+        return data.qvel[0], False, {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("flags", ["", '<flag spring="disable"/>'])
+def test_teams_play_what_c_mujoco_plays_on_a_cpu(teams, flags):
+    """Elliptic cones, which MJX has, and a flag for which it refuses the model."""
+    env = _Box(flags)
+    actor, act, distribution = actor_and_act(env, (5,))
+    policy = choice.ActingPolicy(act, actor, distribution)
+    trajectories = []
+    for begins, name in ((list, "mujoco"), (teams, "native")):
+        made = begins()
+        engine = choice.choose("auto", env, policy, 30)
+        assert engine.name == name
+        trajectories.append(played(engine.rollout, env, (actor, act, distribution)))
+    assert {kernel.launch.lanes for kernel in made} == {16}
+    assert np.ptp(trajectories[0].observation[..., 0]) > 0.05
+    for field in ("observation", "action", "reward"):
+        pair = (getattr(x, field) for x in trajectories)
+        np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=field)
