@@ -38,10 +38,16 @@ _TWO = """
 <mujoco>
   <option gravity="0 0 0"/>
   <worldbody>
-    <geom type="capsule" size="{first}"/>
-    <body><freejoint/><geom type="box" size="{second}"/></body>
+    <geom {first}/>
+    <body><freejoint/><geom {second}/></body>
   </worldbody>
 </mujoco>"""
+_PAIRS = [
+    ("capsule", "box"),
+    ("plane", "cylinder"),
+    ("plane", "ellipsoid"),
+    ("sphere", "cylinder"),
+]
 _REFUSED = {
     **_MODELS["refused"],
     "4096 geoms or more": {"rest": f"<worldbody>{_MANY * 4096}</worldbody>"},
@@ -162,13 +168,16 @@ def test_features(feature, tmp_path):
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize("sizes", ["longer", "flatter"])
-def test_a_capsule_meets_a_box_in_every_pose(sizes, tmp_path):
+@pytest.mark.parametrize("kinds", _PAIRS, ids="-".join)
+def test_two_geoms_meet_in_every_pose(kinds, sizes, tmp_path):
     """Of the families of ``experiments.checks.contacts``."""
-    geoms, rng = contacts.TwoGeoms("capsule", "box"), np.random.default_rng(0)
+    geoms, rng = contacts.TwoGeoms(*kinds), np.random.default_rng(0)
     turns = ("any", "nearly aligned")  # where rounding decides nothing
     families = [x for x in contacts.FAMILIES if x[0] == sizes and x[1] in turns for _ in range(12)]
     size = contacts.draw(geoms, families[0], rng).size
-    first, second = (" ".join(map(str, x)) for x in size)
+    first, second = (
+        f'type="{kind}" size="{" ".join(map(str, x))}"' for kind, x in zip(kinds, size, strict=True)
+    )
     m = _exact(_C.MjModel.from_xml_string(_TWO.format(first=first, second=second)))
     play, errors = _compiled(m, tmp_path, tables.NUM_NEAR, 1), []
     for family in families:

@@ -8,12 +8,19 @@ DEV Touch touch_of(const Model& M, const State& s, int item, real margin) {
   Touch c;
   for (int k = 0; k < 3; k++) c.tangent[k] = 0;
   const int below = M.geom_kind[a], above = M.geom_kind[b];
-  if (HAS_BOX && above == BOX) {
-    if (below == PLANE) {
-      touch_box_on_plane(M, s, a, b, part, margin, c);
-    } else {
-      touch_round_and_box(M, s, a, b, part, c);
-    }
+  const auto are = [&](int flat, int other) {
+    return may_meet(flat, other) && below == flat && above == other;
+  };
+  if (are(PLANE, BOX)) {
+    touch_box_on_plane(M, s, a, b, part, margin, c);
+  } else if (are(ROUND, BOX)) {
+    touch_round_and_box(M, s, a, b, part, c);
+  } else if (are(PLANE, CYLINDER)) {
+    touch_cylinder_on_plane(M, s, a, b, part, c);
+  } else if (are(ROUND, CYLINDER)) {
+    touch_sphere_and_cylinder(M, s, a, b, c);
+  } else if (are(PLANE, ELLIPSOID)) {
+    touch_ellipsoid_on_plane(M, s, a, b, c);
   } else if (below == PLANE) {
     const Quad q = s.geom_place[b], axis = s.geom_axis[b];
     const real half = M.geom_half[b], along = part ? -half : half;
