@@ -37,6 +37,7 @@ NUM_PARTS = {
     (CAPSULE, BOX): 2,
     (PLANE, BOX): 4,
     (PLANE, CYLINDER): 4,
+    (BOX, BOX): 8,
 }
 
 

@@ -46,6 +46,7 @@ _HEADERS = [
     "rounds",
     "boxes",
     "cylinders",
+    "two_boxes",
     "collision",
     "equality",
     "elimination",

@@ -15,6 +15,8 @@ DEV Touch touch_of(const Model& M, const State& s, int item, real margin) {
     touch_box_on_plane(M, s, a, b, part, margin, c);
   } else if (are(ROUND, BOX)) {
     touch_round_and_box(M, s, a, b, part, c);
+  } else if (are(BOX, BOX)) {
+    touch_boxes(M, s, a, b, part, margin, c);
   } else if (are(PLANE, CYLINDER)) {
     touch_cylinder_on_plane(M, s, a, b, part, c);
   } else if (are(ROUND, CYLINDER)) {
