@@ -47,7 +47,10 @@ DEV void make_frame(real* frame, const Touch& c) {
   }
   const real across = dot(c.normal, along);
   for (int k = 0; k < 3; k++) along[k] -= across * c.normal[k];
-  const real scale = inverse_root(dot(along, along));
+  const real square = dot(along, along);
+  const bool upright = square < real(1e-30);  // a capsule that stands on a plane
+  const real scale = inverse_root(upright ? real(1) : square);
+  if (upright) along[0] = 1;
   for (int k = 0; k < 3; k++) {
     frame[k] = c.normal[k];
     frame[3 + k] = scale * along[k];
