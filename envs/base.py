@@ -24,6 +24,7 @@ from mjx_reinforce.engine.physics import mjx_internals, sensors
 from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
 from mjx_reinforce.engine.scalar import prune, whole
+from mjx_reinforce.engine.team import supported
 from mjx_reinforce.envs import derived, in_batch, models, refusals
 from mjx_reinforce.envs.outcomes import (
     check_centers,
@@ -232,7 +233,7 @@ class MujocoEnv(Env):
             check_name("field of a start", field, shapes)
             check_shape(field, value, shapes[field])
         # What MJX refuses, C MuJoCo plays, whoever asks.
-        if self.refusal is not None:
+        if self._is_played_by_c():
             return self._in_c_mujoco.set_state(qpos, qvel, episode, **fields)
         # Whether the physics stays whole is asked during tracing, and the jitted start may have
         # been traced where it does not.
@@ -328,28 +329,19 @@ class MujocoEnv(Env):
         The reward is NaN where C MuJoCo would have reset the simulation, see ``_is_sound``.
         """
         check_shape("the action", action, (self.action_size,))
-        if self.refusal is not None:
+        if self._is_played_by_c():
             return self._in_c_mujoco.step(state, action)
         before = cast(Any, state.pipeline_state)
         # All else in mjData follows from what is carried, or stays as the model has it.
         mocap = _mocap(before.carried)
         start_data = models.make_data(self.mj_model).replace(**_carried(before), **mocap)
-        _, physics_step = self._physics_of(before.episode, before.constants)
-
-        def advance(_: int, carry: tuple[mjx.Data, jax.Array]) -> tuple[mjx.Data, jax.Array]:
-            """One physics step; sound until the first that C MuJoCo would not have made."""
-            data, is_sound = carry
-            data = physics.like(physics_step(data), data)
-            return data, is_sound & _is_sound(data)
-
         name = type(self).__name__
         control = check_control(name, self.control(action), action, self.mj_model.nu)
         start_data = start_data.replace(ctrl=jnp.asarray(control, start_data.ctrl.dtype))
         if self._stays_whole(before.episode):
             data, is_sound = self._whole("physics", start_data)
         else:
-            start_of_loop = start_data, jnp.array(True)
-            data, is_sound = jax.lax.fori_loop(0, self.frame_skip, advance, start_of_loop)
+            data, is_sound = self._advance(before, start_data)
             # Once an env step, as Gymnasium's ``do_simulation`` calls it after the last mj_step.
             if self.contact_forces:
                 model = self._model_of(before.episode, before.constants)
@@ -366,6 +358,18 @@ class MujocoEnv(Env):
             metrics=state.metrics | jax.tree.map(lambda x: jnp.asarray(x, dtype), terms),
         )
 
+    def _advance(self, before: Physics, start: mjx.Data) -> tuple[mjx.Data, jax.Array]:
+        """Returns the simulation after an env step's physics steps, and whether it is sound []."""
+        _, physics_step = self._physics_of(before.episode, before.constants)
+
+        def advance(_: int, carry: tuple[mjx.Data, jax.Array]) -> tuple[mjx.Data, jax.Array]:
+            """One physics step; sound until the first that C MuJoCo would not have made."""
+            data, is_sound = carry
+            data = physics.like(physics_step(data), data)
+            return data, is_sound & _is_sound(data)
+
+        return jax.lax.fori_loop(0, self.frame_skip, advance, (start, jnp.array(True)))
+
     def physics_model(self) -> PhysicsModel:
         """Returns what an env step simulates, for engines that compute the physics themselves."""
         digest = f"{self._model_digest} {self.frame_skip}"
@@ -375,6 +379,15 @@ class MujocoEnv(Env):
     def _model_digest(self) -> str:
         """The model's hash, computed once: with large meshes that takes long, each trace asks."""
         return models.digest(self.mj_model)
+
+    def _is_played_by_c(self) -> bool:
+        """Returns whether neither MJX nor the device code that asks simulates this model."""
+        return self.refusal is not None and not (is_kept_whole() and self._has_device_code)
+
+    @functools.cached_property
+    def _has_device_code(self) -> bool:
+        """Whether teams of lanes simulate a model that MJX refuses, and MJX has its data."""
+        return supported.why(self.mj_model) is None and models.has_data(self.mj_model)
 
     def _stays_whole(self, episode: dict[str, jax.Array]) -> bool:
         """Returns whether the physics is to stay one operation, which device code computes."""

@@ -149,6 +149,15 @@ def make_data(model: "mjx.Model") -> mjx.Data:
     return contacts.make_data(model, jax.local_devices()[0])
 
 
+def has_data(model: MjModel) -> bool:
+    """Returns whether MJX has a simulation of a model, which it need not be able to step."""
+    try:
+        jax.eval_shape(lambda: make_data(model))
+    except Exception:  # whatever MJX raises of what it does not know
+        return False
+    return True
+
+
 def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
     """Returns MJX's version of a model.
 

@@ -15,8 +15,9 @@ _C: Any = mujoco  # a C extension without stubs
 #: MuJoCo's mjtJoint.
 FREE, BALL, SLIDE, HINGE = range(4)
 #: MuJoCo's mjtGeom.
-PLANE, SPHERE, CAPSULE, BOX = (
-    int(getattr(_C.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "SPHERE", "CAPSULE", "BOX")
+PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = (
+    int(getattr(_C.mjtGeom, f"mjGEOM_{name}"))
+    for name in ("PLANE", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX")
 )
 #: Bits of a mask of degrees of freedom, of which the widest is an unsigned long long.
 MAX_DOFS = 64
@@ -30,10 +31,14 @@ NUM_PARTS = {
     (SPHERE, SPHERE): 1,
     (SPHERE, CAPSULE): 1,
     (SPHERE, BOX): 1,
+    (SPHERE, CYLINDER): 1,
+    (PLANE, ELLIPSOID): 1,
     (CAPSULE, CAPSULE): 1,
     (PLANE, CAPSULE): 2,
     (CAPSULE, BOX): 2,
     (PLANE, BOX): 4,
+    (PLANE, CYLINDER): 4,
+    (BOX, BOX): 8,
 }
 
 

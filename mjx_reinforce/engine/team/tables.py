@@ -18,7 +18,19 @@ from mjx_reinforce.engine.scalar import UnsupportedPrimitive
 from mjx_reinforce.engine.team import flags, records, supported
 from mjx_reinforce.engine.team.frames import Frame, Inertial, rotation, six, times
 from mjx_reinforce.engine.team.records import Softness
-from mjx_reinforce.engine.team.supported import BALL, BOX, CAPSULE, FREE, HINGE, PLANE, SLIDE, why
+from mjx_reinforce.engine.team.supported import (
+    BALL,
+    BOX,
+    CAPSULE,
+    CYLINDER,
+    ELLIPSOID,
+    FREE,
+    HINGE,
+    PLANE,
+    SLIDE,
+    SPHERE,
+    why,
+)
 
 _C: Any = mujoco  # a C extension without stubs
 #: The files of the device code, each after those that it uses. What the tables use is before them.
@@ -35,6 +47,8 @@ _HEADERS = [
     "contact_rows",
     "rounds",
     "boxes",
+    "cylinders",
+    "two_boxes",
     "collision",
     "equality",
     "elimination",
@@ -49,6 +63,8 @@ _HEADERS = [
 NUM_NEAR = 8
 #: How a degree of freedom moves what it carries, by ``device/kinematics.h``.
 _TURNS, _SHIFTS, _SHIFTS_IN_THE_WORLD = range(3)
+#: Geoms by the enum of ``device/rounds.h``.
+_GEOM_KINDS = {PLANE: 0, SPHERE: 1, CAPSULE: 1, BOX: 2, CYLINDER: 3, ELLIPSOID: 4}
 #: MuJoCo's mjMINVAL, mjMINMU, mjMINIMP and mjMAXIMP.
 _MIN_VALUE = 1e-15
 _MIN_FRICTION = 1e-5
@@ -509,6 +525,7 @@ class _Tables:
         geoms = sorted({geom for pair, _ in pairs for geom in (pair.geom1, pair.geom2)})
         geom_ids = {geom: number for number, geom in enumerate(geoms)}
         kind_numbers: dict[_ContactKind, int] = {}
+        kind_pairs = 0
         items = []
         item_kinds = []
         weights = []
@@ -520,7 +537,9 @@ class _Tables:
                 # Of an edge of the pyramid, which pushes along a tangent, too.
                 friction = contact_kind.friction[0]
                 weight *= 2 * friction**2 / model.opt.impratio * (1 + friction**2)
-            for part in range(supported.NUM_PARTS[supported.geom_kinds(model, pair)]):
+            flat, other = geom_types = supported.geom_kinds(model, pair)
+            kind_pairs |= 1 << (8 * _GEOM_KINDS[flat] + _GEOM_KINDS[other])
+            for part in range(supported.NUM_PARTS[geom_types]):
                 items.append(records.packed_item(geom_ids[pair.geom1], geom_ids[pair.geom2], part))
                 item_kinds.append(kind)
                 weights.append(weight)
@@ -539,6 +558,7 @@ class _Tables:
             root = np.sqrt(max(model.opt.impratio, _MIN_VALUE))
             self.reals["kind_mu"] = [x.friction[0] / root for x in rows]
             self.ints["kind_soft_friction"] = [x.soft_friction for x in rows]
+        self.constants["KIND_PAIRS"] = kind_pairs
         self.constants["NI"] = len(items)
         self.constants["NEAR"] = max(1, min(num_near, len(items)))
         self.constants["CD"] = max(x.dim for x in rows)
@@ -555,27 +575,21 @@ class _Tables:
         ]
         types = model.geom_type[geoms]
         size = model.geom_size[geoms]
-        is_plane = types == PLANE
-        is_box = types == BOX
-        radii = np.where(is_plane | is_box, 0, size[:, 0])
-        half_lengths = np.where(types == CAPSULE, size[:, 1], 0)
-        reach = np.where(is_box, np.linalg.norm(size, axis=1), radii + half_lengths)
+        has_radius = np.isin(types, (SPHERE, CAPSULE, CYLINDER))
+        has_length = np.isin(types, (CAPSULE, CYLINDER))
         turns = [rotation(frame.quat) for frame in frames]
-        # By the enum of rounds.h: a plane, what is round, a box.
-        self.ints["geom_kind"] = np.where(is_box, 2, ~is_plane)
+        self.ints["geom_kind"] = [_GEOM_KINDS[x] for x in types]
         self.ints["geom_body"] = bodies
         self.ints["geom_link"] = [self._link_number(frame.link) for frame in frames]
         self.reals["geom_at"] = [frame.pos for frame in frames]
         self.reals["geom_axis"] = [turn[:, 2] for turn in turns]
-        self.reals["geom_radius"] = radii
-        self.reals["geom_half"] = half_lengths
-        self.reals["geom_reach"] = reach
-        # Shared memory is scarce: only boxes have a turn about the axis and three sizes.
-        has_box = is_box.any()
-        self.constants["HAS_BOX"] = has_box
+        self.reals["geom_radius"] = np.where(has_radius, size[:, 0], 0)
+        self.reals["geom_half"] = np.where(has_length, size[:, 1], 0)
+        self.reals["geom_reach"] = model.geom_rbound[geoms]
+        # Shared memory is scarce: what has no turn about the axis needs neither that nor sizes.
         self.reals["geom_turn"] = []
         self.reals["geom_size"] = []
-        if has_box:
+        if np.isin(types, (BOX, CYLINDER, ELLIPSOID)).any():
             self.reals |= {"geom_turn": turns, "geom_size": size}
 
     def _contact_kind(self, pair: supported.GeomPair) -> _ContactKind:

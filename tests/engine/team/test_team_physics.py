@@ -38,10 +38,17 @@ _TWO = """
 <mujoco>
   <option gravity="0 0 0"/>
   <worldbody>
-    <geom type="capsule" size="{first}"/>
-    <body><freejoint/><geom type="box" size="{second}"/></body>
+    <geom {first}/>
+    <body><freejoint/><geom {second}/></body>
   </worldbody>
 </mujoco>"""
+_PAIRS = [
+    ("capsule", "box"),
+    ("plane", "cylinder"),
+    ("plane", "ellipsoid"),
+    ("sphere", "cylinder"),
+    ("box", "box"),
+]
 _REFUSED = {
     **_MODELS["refused"],
     "4096 geoms or more": {"rest": f"<worldbody>{_MANY * 4096}</worldbody>"},
@@ -179,13 +186,16 @@ def test_a_quadruped_that_takes_few_steps(cone, tmp_path):
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize("sizes", ["longer", "flatter"])
-def test_a_capsule_meets_a_box_in_every_pose(sizes, tmp_path):
+@pytest.mark.parametrize("kinds", _PAIRS, ids="-".join)
+def test_two_geoms_meet_in_every_pose(kinds, sizes, tmp_path):
     """Of the families of ``experiments.checks.contacts``."""
-    geoms, rng = contacts.TwoGeoms("capsule", "box"), np.random.default_rng(0)
+    geoms, rng = contacts.TwoGeoms(*kinds), np.random.default_rng(0)
     turns = ("any", "nearly aligned")  # where rounding decides nothing
     families = [x for x in contacts.FAMILIES if x[0] == sizes and x[1] in turns for _ in range(12)]
     size = contacts.draw(geoms, families[0], rng).size
-    first, second = (" ".join(map(str, x)) for x in size)
+    first, second = (
+        f'type="{kind}" size="{" ".join(map(str, x))}"' for kind, x in zip(kinds, size, strict=True)
+    )
     m = _exact(_C.MjModel.from_xml_string(_TWO.format(first=first, second=second)))
     play, errors = _compiled(m, tmp_path, tables.NUM_NEAR, 1), []
     for family in families:
@@ -213,8 +223,8 @@ def test_actuators_of_several_controls_are_named():
 
 
 def test_a_model_that_is_not_covered_has_no_device_code():
-    m = _model(**_REFUSED["a box that meets a box"])
-    with pytest.raises(UnsupportedPrimitive, match="a box that meets a box"):
+    m = _model(**_REFUSED["a cylinder that meets a cylinder"])
+    with pytest.raises(UnsupportedPrimitive, match="a cylinder that meets a cylinder"):
         tables.physics_text(m)
 
 

@@ -1,24 +1,11 @@
 // Contacts of boxes with planes, spheres and capsules.
 #pragma once
 
-DEV Pose box_pose(const Model& M, const State& s, int g) {
-  const Pose& p = s.pose[M.geom_link[g]];
-  const real* turn = M.geom_turn + 9 * g;
-  Pose box;
-  for (int k = 0; k < 3; k++) {
-    for (int j = 0; j < 3; j++)
-      box.row[k].x[j] = p.row[k].x[0] * turn[j] + p.row[k].x[1] * turn[3 + j] +
-                        p.row[k].x[2] * turn[6 + j];
-    box.row[k].x[3] = s.geom_place[g].x[k];
-  }
-  return box;
-}
-
 // The lower corners of a box above a plane: the part-th of those that look down and are near
 // enough, as C numbers them (mjc_PlaneBox).
 DEV void touch_box_on_plane(const Model& M, const State& s, int a, int b, int part, real margin,
                             Touch& c) {
-  const Pose box = box_pose(M, s, b);
+  const Pose box = geom_pose(M, s, b);
   const Quad plane = s.geom_place[a], up = s.geom_axis[a];
   const real* size = M.geom_size + 3 * b;
   real center[3];
@@ -173,7 +160,7 @@ DEV OnBox along_box(const real* size, const real* center, const real* axis, real
 }
 
 DEV void touch_round_and_box(const Model& M, const State& s, int a, int b, int part, Touch& c) {
-  const Pose box = box_pose(M, s, b);
+  const Pose box = geom_pose(M, s, b);
   const Quad p = s.geom_place[a];
   const real half = M.geom_half[a], *size = M.geom_size + 3 * b;
   real away[3], own[3];

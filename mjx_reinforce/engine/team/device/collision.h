@@ -8,12 +8,21 @@ DEV Touch touch_of(const Model& M, const State& s, int item, real margin) {
   Touch c;
   for (int k = 0; k < 3; k++) c.tangent[k] = 0;
   const int below = M.geom_kind[a], above = M.geom_kind[b];
-  if (HAS_BOX && above == BOX) {
-    if (below == PLANE) {
-      touch_box_on_plane(M, s, a, b, part, margin, c);
-    } else {
-      touch_round_and_box(M, s, a, b, part, c);
-    }
+  const auto are = [&](int flat, int other) {
+    return may_meet(flat, other) && below == flat && above == other;
+  };
+  if (are(PLANE, BOX)) {
+    touch_box_on_plane(M, s, a, b, part, margin, c);
+  } else if (are(ROUND, BOX)) {
+    touch_round_and_box(M, s, a, b, part, c);
+  } else if (are(BOX, BOX)) {
+    touch_boxes(M, s, a, b, part, margin, c);
+  } else if (are(PLANE, CYLINDER)) {
+    touch_cylinder_on_plane(M, s, a, b, part, c);
+  } else if (are(ROUND, CYLINDER)) {
+    touch_sphere_and_cylinder(M, s, a, b, c);
+  } else if (are(PLANE, ELLIPSOID)) {
+    touch_ellipsoid_on_plane(M, s, a, b, c);
   } else if (below == PLANE) {
     const Quad q = s.geom_place[b], axis = s.geom_axis[b];
     const real half = M.geom_half[b], along = part ? -half : half;
@@ -38,7 +47,10 @@ DEV void make_frame(real* frame, const Touch& c) {
   }
   const real across = dot(c.normal, along);
   for (int k = 0; k < 3; k++) along[k] -= across * c.normal[k];
-  const real scale = inverse_root(dot(along, along));
+  const real square = dot(along, along);
+  const bool upright = square < real(1e-30);  // a capsule that stands on a plane
+  const real scale = inverse_root(upright ? real(1) : square);
+  if (upright) along[0] = 1;
   for (int k = 0; k < 3; k++) {
     frame[k] = c.normal[k];
     frame[3 + k] = scale * along[k];

@@ -118,3 +118,16 @@ DEV void place_geoms(const Team& t, const Model& M, State& s) {
     s.geom_axis[g] = {axis[0], axis[1], axis[2], 0};
   }
 }
+// The pose of a geom whose turn about its axis matters.
+DEV Pose geom_pose(const Model& M, const State& s, int g) {
+  const Pose& p = s.pose[M.geom_link[g]];
+  const real* turn = M.geom_turn + 9 * g;
+  Pose geom;
+  for (int k = 0; k < 3; k++) {
+    for (int j = 0; j < 3; j++)
+      geom.row[k].x[j] = p.row[k].x[0] * turn[j] + p.row[k].x[1] * turn[3 + j] +
+                        p.row[k].x[2] * turn[6 + j];
+    geom.row[k].x[3] = s.geom_place[g].x[k];
+  }
+  return geom;
+}

@@ -1,7 +1,9 @@
 // Contacts of spheres, capsules and planes.
 #pragma once
 
-enum { PLANE, ROUND, BOX };  // geoms; round are spheres and capsules
+enum { PLANE, ROUND, BOX, CYLINDER, ELLIPSOID };  // geoms; round are spheres and capsules
+// Whether the model has two such geoms that may meet.
+DEV constexpr bool may_meet(int flat, int other) { return KIND_PAIRS >> (8 * flat + other) & 1; }
 
 struct Touch {
   real distance, at[3], normal[3], tangent[3];
