@@ -41,6 +41,7 @@ FIELDS = {
     "Loss": {"most": 1, "weight": 1},
     "Range": {"low": 1, "high": 1},
     "Friction": {"along": 5},
+    "Held": {"moment": 3, "mass": 1},
 }
 #: The structs of the tables whose rows are some.
 STRUCTS = {
@@ -53,6 +54,7 @@ STRUCTS = {
     "dof_loss": "Loss",
     "dof_force": "Range",
     "kind_friction": "Friction",
+    "held": "Held",
 }
 
 

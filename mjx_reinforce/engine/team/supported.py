@@ -83,7 +83,6 @@ def _lacking_parts(model: Any) -> Iterable[tuple[str, Any]]:
     yield f"{_MAX_GEOMS} geoms or more", model.ngeom >= _MAX_GEOMS
     yield "flexes or plugins", model.nflex or model.nplugin
     yield "mocap bodies", model.nmocap
-    yield "gravity compensation", np.any(model.body_gravcomp)
     # A tendon that only measures pushes nothing, and is no hindrance.
     tendons = (
         model.tendon_stiffness,

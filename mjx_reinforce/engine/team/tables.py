@@ -27,6 +27,7 @@ _HEADERS = [
     "state",
     "block",
     "kinematics",
+    "passive",
     "dynamics",
     "impedance",
     "bounds",
@@ -121,6 +122,7 @@ class _Tables:
         self._links()
         self._bodies()
         self._dofs()
+        self._held()
         self._actuators()
         self._equalities()
         self._pairs(num_near)
@@ -131,6 +133,7 @@ class _Tables:
         self.constants["NB"] = model.nbody
         self.constants["NU"] = max(model.nu, 1)
         self.constants["IMPLICIT"] = self._implicit()
+        self.constants["PASSIVE"] = self.constants["NHELD"]
         self.constants["RK4"] = int(model.opt.integrator == _C.mjtIntegrator.mjINT_RK4)
         self.constants["ANY_POWER"] = int(any(x.power != 2 for x in self.soft))
         self.reals["soft"] = list(self.soft)
@@ -147,6 +150,7 @@ class _Tables:
             lines.append(f"  constexpr int table[] = {{{table}}};\n  return table[i];\n}}")
         lines.append("struct Model {")
         lines.append("  real timestep, smallest_gain;")
+        empty = []
         # In float32 a step that lowers the cost by less is rounding; in float64 the search goes on
         # until no row changes.
         gain = 1e-10 * self.model.stat.meaninertia * self.model.nv
@@ -160,12 +164,17 @@ class _Tables:
             ("real", lambda x: f"real({float(x)!r})", self.reals),
         ):
             for name, values in arrays.items():
-                entries = np.asarray(values).ravel().tolist() or [0]  # C++ has no empty array
+                entries = np.asarray(values).ravel().tolist()
                 struct = records.STRUCTS.get(name, type_name)
+                if not entries:
+                    empty.append(f"{struct} {name}[1];")
+                    continue
                 row_size = records.size(struct)
                 lines.append(f"  {struct} {name}[{-(-len(entries) // row_size)}];")
                 initial_values.append("{" + ",".join(map(literal, entries)) + "}")
-        lines.append("};")
+        # C++ has no empty array: those that are share a place.
+        lines += [f"  union {{ int none; {' '.join(empty)} }};", "};"]
+        initial_values.append("{0}")
         lines += records.checks()
         lines.append("#define MODEL_INIT {" + ",\\\n".join(initial_values) + "}")
         return "\n".join(lines)
@@ -267,6 +276,23 @@ class _Tables:
         self.reals["link_mass"] = masses
         self.reals["link_com"] = [x.com for x in links]
         self.reals["link_inertia"] = [six(x.inertia) for x in links]
+
+    def _held(self) -> None:
+        """Makes the tables of what gravity compensation holds, a row a link."""
+        model = self.model
+        held_masses = model.body_mass * model.body_gravcomp
+        held_links: dict[int, np.ndarray] = {}
+        for frame, mass, ipos in zip(self.frames, held_masses, model.body_ipos, strict=True):
+            if mass and frame.link >= 0:
+                row = mass * np.array([*frame.place(ipos), 1])
+                held_links[frame.link] = held_links.get(frame.link, 0) + row
+        self.ints["held_link"] = list(held_links)
+        self.reals["held"] = list(held_links.values())
+        # Of these joints the actuators' force includes it; without an actuator there is none.
+        acts = np.asarray(model.jnt_actgravcomp, bool)[self.dof_joint] & bool(held_links)
+        self.ints["dof_acts_held"] = acts if held_links else []
+        self.constants["NHELD"] = len(held_links)
+        self.constants["ACTS_HELD"] = int(acts.any() and model.nu > 0)
 
     def _dofs(self) -> None:
         """Makes the tables of degrees of freedom."""

@@ -56,12 +56,13 @@ def _model(
     first: str = "",
     second: str = 'axis="0 1 0"',
     actuator: str = "",
+    body: str = "",
     **parts: str,
 ) -> Any:
     """Returns the model of parts as models.toml has them."""
     geoms = 'contype="0"' if bodies is None else ""
     if bodies is None:
-        world = _MODELS["arm"].format(first=first, second=second)
+        world = _MODELS["arm"].format(first=first, second=second, body=body)
     for n, geom in enumerate(bodies or ()):
         at, turned = f"{0.17 * n} {0.03 * n} {height}", f"{20 * n} 25 {40 * n}"
         world += f'<body pos="{at}" euler="{turned}"><freejoint/><geom {geom}/></body>'

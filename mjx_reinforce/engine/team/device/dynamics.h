@@ -30,6 +30,7 @@ DEV void actuate(const Team& t, const Model& M, State& s) {
       if (IMPLICIT == 2 && push > p.force_low && push < p.force_high)
         drag -= p.gear * p.gear * (p.bias_by_speed + p.gain_by_speed * control);
     }
+    if (ACTS_HELD && M.dof_acts_held[i]) force += compensation(M, s, i);
     const Range range = M.dof_force[i];
     const bool bounded = IMPLICIT == 1 || force <= range.low || force >= range.high;
     if (IMPLICIT) s.drag[i] = bounded ? M.dof_damping[i] : drag;
@@ -113,6 +114,7 @@ DEV void forces_and_inertia(const Team& t, const Model& M, State& s) {
     real imbalance =
         dot6(force, moves) + armature * s.qacc_warmstart[i] + M.dof_damping[i] * s.qvel[i];
     imbalance += M.dof_stiffness[i] * (s.qpos[M.dof_qpos[i]] - M.dof_spring[i]);
+    if (PASSIVE) imbalance += s.imbalance[i];
     s.imbalance[i] = imbalance - s.qfrc_actuator[i];
   }
   t.sync();

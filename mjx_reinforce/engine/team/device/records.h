@@ -37,5 +37,7 @@ struct Limit { real range[2], margin, weight; };
 // The most that friction loss pushes, and the inverse mass of its row.
 struct Loss { real most, weight; };
 struct Range { real low, high; };
+// What gravity compensation holds of a link: the mass times its place in the link's frame, the mass.
+struct Held { real moment[3], mass; };
 // Along the two tangents, about the normal, about the two tangents.
 struct Friction { real along[5]; };
