@@ -41,6 +41,8 @@ FIELDS = {
     "Loss": {"most": 1, "weight": 1},
     "Range": {"low": 1, "high": 1},
     "Friction": {"along": 5},
+    "Part": {"at": 3, "gear": 6},
+    "Tendon": {"stiffness": 3, "damping": 3, "rest": 2},
     "Held": {"moment": 3, "mass": 1},
 }
 #: The structs of the tables whose rows are some.
@@ -54,6 +56,9 @@ STRUCTS = {
     "dof_loss": "Loss",
     "dof_force": "Range",
     "kind_friction": "Friction",
+    "part": "Part",
+    "tendon": "Tendon",
+    "bound": "Limit",
     "held": "Held",
 }
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.scalar import UnsupportedPrimitive
-from mjx_reinforce.engine.team import records, supported
+from mjx_reinforce.engine.team import cables, records, supported
 from mjx_reinforce.engine.team.frames import Frame, Inertial, rotation, six, times
 from mjx_reinforce.engine.team.records import Softness
 from mjx_reinforce.engine.team.supported import BALL, BOX, CAPSULE, FREE, HINGE, PLANE, SLIDE, why
@@ -27,10 +27,11 @@ _HEADERS = [
     "state",
     "block",
     "kinematics",
-    "passive",
-    "dynamics",
     "impedance",
     "bounds",
+    "cables",
+    "passive",
+    "dynamics",
     "contact_rows",
     "rounds",
     "boxes",
@@ -123,8 +124,10 @@ class _Tables:
         self._bodies()
         self._dofs()
         self._held()
+        self._cables()
         self._actuators()
         self._equalities()
+        self._cable_bounds()
         self._pairs(num_near)
         self._jumps()
         self.constants["NQ"] = model.nq
@@ -133,7 +136,8 @@ class _Tables:
         self.constants["NB"] = model.nbody
         self.constants["NU"] = max(model.nu, 1)
         self.constants["IMPLICIT"] = self._implicit()
-        self.constants["PASSIVE"] = self.constants["NHELD"]
+        is_passive = self.constants["NHELD"] or self.constants["TENSE"]
+        self.constants["PASSIVE"] = int(is_passive)
         self.constants["RK4"] = int(model.opt.integrator == _C.mjtIntegrator.mjINT_RK4)
         self.constants["ANY_POWER"] = int(any(x.power != 2 for x in self.soft))
         self.reals["soft"] = list(self.soft)
@@ -400,11 +404,61 @@ class _Tables:
         softness = Softness(stiffness, damping, dmin, dmax - dmin, width, midpoint, power)
         return self.soft.setdefault(Softness(*map(float, softness)), len(self.soft))
 
+    def _cables(self) -> None:
+        """Makes the tables of cables."""
+        model = self.model
+        self.cables = cables.of_model(model, self.frames, self.parents, self.reals["link_quat"])
+        parts = [part for cable in self.cables for part in cable.parts]
+        self.ints["cable_part"] = np.cumsum([0, *(len(x.parts) for x in self.cables)])
+        self.ints["part_kind"] = [x.kind for x in parts]
+        self.ints["part_on"] = [self._link_number(x.on) for x in parts]
+        self.ints["part_off"] = [self._link_number(x.off) for x in parts]
+        self.ints["part_body"] = [x.bodies for x in parts]
+        self.constants["SEGMENTS"] = int(any(x.kind == cables.SEGMENT for x in parts))
+        self.ints["part_frame"] = [self._link_number(x.frame) for x in parts]
+        self.reals["part"] = [(*x.at, *x.gear) for x in parts]
+        tendons = [cables.spring(model, x.tendon) for x in self.cables]
+        self.constants["TENSE"] = int(any(any(x.stiffness + x.damping) for x in tendons))
+        self.reals["tendon"] = [sum(x, ()) for x in tendons] if self.constants["TENSE"] else []
+        self.constants["NCABLE"] = len(self.cables)
+
+    def _cable_bounds(self) -> None:
+        """Makes the tables of limits and, behind them, of friction loss of cables."""
+        limits = cables.limits(self.model, self.cables)
+        losses = cables.losses(self.model, self.cables)
+        rows = [*limits, *losses]
+        self.ints["bound_cable"] = [x.cable for x in rows]
+        self.ints["bound_soft"] = [self._soft(x.solref, x.solimp) for x in rows]
+        self.ints["bound_sides"] = [x.sides for x in limits]
+        self.reals["bound"] = [(*x.range, x.margin, x.weight) for x in rows]
+        self.reals["bound_loss"] = [x.loss for x in losses]
+        self.constants["NLIMITED"] = len(limits)
+        self.constants["NLOSS"] = len(losses)
+        self.constants["NE"] += len(rows)
+
+    def _targets(self) -> np.ndarray:
+        """Returns what actuators drive: a degree of freedom, or the number of a cable after all."""
+        model = self.model
+        of_tendons = {x.tendon: n for n, x in enumerate(self.cables)}
+        of_actuators = {x.actuator: n for n, x in enumerate(self.cables)}
+        targets = []
+        for actuator, (number, _) in enumerate(model.actuator_trnid):
+            if actuator in of_actuators:
+                targets.append(model.nv + of_actuators[actuator])
+            elif model.actuator_trntype[actuator] == _C.mjtTrn.mjTRN_TENDON:
+                targets.append(model.nv + of_tendons[number])
+            else:
+                targets.append(model.jnt_dofadr[number])
+        return np.array(targets, int)
+
     def _actuators(self) -> None:
         """Makes the tables of actuators, in the order of the degrees of freedom that they move."""
         model = self.model
-        dofs = model.jnt_dofadr[model.actuator_trnid[:, 0]]
-        order = np.argsort(dofs, kind="stable")
+        targets = self._targets()
+        gear = model.actuator_gear[:, 0].copy()
+        # The moments of an actuator's own cable have its gear.
+        gear[[x.actuator for x in self.cables if x.actuator >= 0]] = 1
+        order = np.argsort(targets, kind="stable")
         no_range = (-_NO_LIMIT, _NO_LIMIT)
         controls = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, no_range)
         forces = np.where(model.actuator_forcelimited[:, None], model.actuator_forcerange, no_range)
@@ -416,7 +470,7 @@ class _Tables:
         self._records(
             "actuator",
             order,
-            gear=model.actuator_gear[:, 0],
+            gear=gear,
             control_low=controls[:, 0],
             control_high=controls[:, 1],
             gain=gain[:, 0],
@@ -429,8 +483,9 @@ class _Tables:
             gain_by_speed=gain[:, 2],
         )
         self.ints["actuator_ctrl"] = model.actuator_ctrladr[order]
-        # Those of a degree of freedom are from its entry up to the next one's.
-        self.ints["dof_actuator"] = np.searchsorted(dofs[order], np.arange(model.nv + 1))
+        # Those of a degree of freedom or a cable are from its entry up to the next one's.
+        counts = np.arange(model.nv + len(self.cables) + 1)
+        self.ints["target_actuator"] = np.searchsorted(targets[order], counts)
         joint = self.dof_joint
         is_limited = model.jnt_actfrclimited[joint, None]
         bounds = np.where(is_limited, model.jnt_actfrcrange[joint], no_range)

@@ -161,6 +161,21 @@ def test_features(feature, tmp_path):
 
 
 @needs_compiler
+@pytest.mark.parametrize("lanes", [2, 8])
+@pytest.mark.parametrize(
+    "feature",
+    [
+        "spatial tendons",
+        "limits and friction loss of tendons",
+        "a tendon between two trees, implicitfast",
+    ],
+)
+def test_lanes_share_cables(feature, lanes, tmp_path):
+    m = _model(**_MODELS["features"][feature])
+    assert _largest_error(m, tmp_path, skip=3, starts=1, lanes=lanes) < 1e-9
+
+
+@needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize("sizes", ["longer", "flatter"])
 def test_a_capsule_meets_a_box_in_every_pose(sizes, tmp_path):

@@ -12,6 +12,7 @@ DEV int forward(const Team& team, const Model& M, State& s) {
   place_dofs(t, M, s);
   place_inertias(t, M, s);
   place_geoms(t, M, s);
+  if (NCABLE) place_cables(t, M, s);
   if (PASSIVE) passive(t, M, s);
   actuate(t, M, s);
   t.sync();

@@ -25,6 +25,10 @@ DEV void passive(const Team& t, const Model& M, State& s) {
   EACH(i, NV) {
     real force = 0;
     if (NHELD && !M.dof_acts_held[i]) force += compensation(M, s, i);
+    for (int n = 0; n < NCABLE && TENSE; n++) {
+      const Cable& cable = s.cables[n];
+      force += cable.moment[i / 4].x[i % 4] * tension(M.tendon[n], cable.length, cable.speed);
+    }
     s.imbalance[i] = -force;
   }
 }
