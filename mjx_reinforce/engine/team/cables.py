@@ -170,13 +170,28 @@ def _joint(model: Any, actuator: int, parent: int, quat: Any) -> Iterable[Part]:
         yield Part(_TWIST, on=joint, off=parent, frame=frame, at=gear[:3], gear=wrench)
 
 
+def of_actuators(model: Any, types: Sequence[Any], count: int) -> np.ndarray:
+    """Returns what actuators of these types add to each of ``count`` joints or tendons, [count, 4].
+
+    Armature, then damping and the rest of its polynomial: mj_actuatorArmature, mj_actuatorDamping.
+    """
+    columns = model.actuator_armature, model.actuator_damping, model.actuator_dampingpoly
+    rows = np.column_stack(columns) * model.actuator_gear[:, :1] ** 2
+    is_driving = np.isin(model.actuator_trntype, types)
+    sums = np.zeros((count, 4))
+    np.add.at(sums, model.actuator_trnid[is_driving, 0], rows[is_driving])
+    return sums
+
+
 def spring(model: Any, tendon: int) -> Spring:
     """Returns how a tendon's spring and damper pull; -1 is no tendon."""
     if tendon < 0:
         return Spring((0.0,) * 3, (0.0,) * 3, (0.0,) * 2)
+    damping = np.array([model.tendon_damping[tendon], *model.tendon_dampingpoly[tendon]])
+    inherited = of_actuators(model, (_C.mjtTrn.mjTRN_TENDON,), model.ntendon)[tendon, 1:]
     return Spring(
         stiffness=(model.tendon_stiffness[tendon], *model.tendon_stiffnesspoly[tendon]),
-        damping=(model.tendon_damping[tendon], *model.tendon_dampingpoly[tendon]),
+        damping=(*(damping + inherited),),
         rest=(*model.tendon_lengthspring[tendon],),
     )
 

@@ -43,6 +43,7 @@ FIELDS = {
     "Friction": {"along": 5},
     "Part": {"at": 3, "gear": 6},
     "Tendon": {"stiffness": 3, "damping": 3, "rest": 2},
+    "Law": {"stiffness": 3, "damping": 3},
     "Held": {"moment": 3, "mass": 1},
 }
 #: The structs of the tables whose rows are some.
@@ -59,6 +60,7 @@ STRUCTS = {
     "part": "Part",
     "tendon": "Tendon",
     "bound": "Limit",
+    "dof_law": "Law",
     "held": "Held",
 }
 

@@ -77,7 +77,6 @@ def _lacking_options(model: Any) -> Iterable[tuple[str, Any]]:
 
 def _lacking_parts(model: Any) -> Iterable[tuple[str, Any]]:
     """Yields what of bodies and constraints the device code lacks, and whether a model has it."""
-    is_scalar = np.isin(model.jnt_type, (HINGE, SLIDE))
     yield "no joints", not model.njnt
     yield f"more than {MAX_DOFS} degrees of freedom", model.nv > MAX_DOFS
     yield f"{_MAX_GEOMS} geoms or more", model.ngeom >= _MAX_GEOMS
@@ -88,12 +87,12 @@ def _lacking_parts(model: Any) -> Iterable[tuple[str, Any]]:
     wraps = model.wrap_type[np.isin(wrap_tendons, pulling)]
     wrapping = (_C.mjtWrap.mjWRAP_SPHERE, _C.mjtWrap.mjWRAP_CYLINDER)
     yield "tendons that wrap geoms", np.isin(wraps, wrapping).any()
-    yield "tendons with armature", np.any(model.tendon_armature)
+    of_tendons = model.actuator_trntype == _C.mjtTrn.mjTRN_TENDON
+    armatures = (model.tendon_armature, model.actuator_armature[of_tendons])
+    yield "tendons with armature", any(np.any(x) for x in armatures)
     yield "tendons that yield", np.any(model.tendon_springyield)
     yield "tendons with a range of actuators' forces", np.any(model.tendon_actfrclimited)
-    polynomials = (model.jnt_stiffnesspoly, model.dof_dampingpoly, model.jnt_springyield)
-    yield "polynomial springs or damping", any(np.any(x) for x in polynomials)
-    yield "springs of free or ball joints", np.any(model.jnt_stiffness[~is_scalar])
+    yield "joints that yield", np.any(model.jnt_springyield)
     # MuJoCo integrates such bodies in a way of its own.
     is_lone = np.bincount(model.dof_treeid, minlength=1) == 6
     dofs = model.jnt_dofadr[model.jnt_type == FREE]
@@ -123,8 +122,6 @@ def _lacking_actuators(model: Any) -> Iterable[tuple[str, Any]]:
     biases = np.isin(model.actuator_biastype, (_C.mjtBias.mjBIAS_NONE, _C.mjtBias.mjBIAS_AFFINE))
     yield "gains or biases other than fixed and affine", not (gains.all() and biases.all())
     yield "activations of actuators", model.na
-    inertias = (model.actuator_armature, model.actuator_damping, model.actuator_dampingpoly)
-    yield "actuators with armature or damping", any(np.any(x) for x in inertias)
     yield "delays of actuators", np.any(model.actuator_delay)
     yield "actuators of several controls", np.any(model.actuator_ctrlnum != 1)
 

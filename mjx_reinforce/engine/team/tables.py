@@ -136,7 +136,7 @@ class _Tables:
         self.constants["NB"] = model.nbody
         self.constants["NU"] = max(model.nu, 1)
         self.constants["IMPLICIT"] = self._implicit()
-        is_passive = self.constants["NHELD"] or self.constants["TENSE"]
+        is_passive = any(self.constants[x] for x in ("NHELD", "TENSE", "SPRUNG"))
         self.constants["PASSIVE"] = int(is_passive)
         self.constants["RK4"] = int(model.opt.integrator == _C.mjtIntegrator.mjINT_RK4)
         self.constants["ANY_POWER"] = int(any(x.power != 2 for x in self.soft))
@@ -189,7 +189,7 @@ class _Tables:
         if opt.integrator == _C.mjtIntegrator.mjINT_IMPLICITFAST:
             return 2
         is_euler = opt.integrator == _C.mjtIntegrator.mjINT_EULER
-        return int(is_euler and self.model.dof_damping.any())
+        return int(is_euler and self.damping.any())
 
     def _records(self, name: str, order: Any = slice(None), **columns: np.ndarray) -> None:
         """Makes a table of structs from the columns of their fields, [rows] or [rows, numbers]."""
@@ -317,9 +317,20 @@ class _Tables:
         self.ints["dof_qpos"] = qpos
         self.ints["dof_turns"] = ~is_single & ~(dof_kinds == _SHIFTS_IN_THE_WORLD)
         self.reals["dof_axis"] = axes
-        self.reals["dof_damping"] = model.dof_damping
-        self.reals["dof_armature"] = model.dof_armature
+        joint_types = (_C.mjtTrn.mjTRN_JOINT, _C.mjtTrn.mjTRN_JOINTINPARENT)
+        inherited = cables.of_actuators(model, joint_types, model.njnt)[joint]
+        self.damping = np.column_stack([model.dof_damping, model.dof_dampingpoly])
+        self.damping += inherited[:, 1:]
+        self.reals["dof_damping"] = self.damping[:, 0]
+        self.reals["dof_armature"] = model.dof_armature + inherited[:, 0]
         self.reals["dof_stiffness"] = np.where(is_single, model.jnt_stiffness[joint], 0)
+        # Beyond these: higher powers, and the springs of free and ball joints.
+        laws = np.column_stack([model.jnt_stiffness, model.jnt_stiffnesspoly])[joint]
+        laws = np.hstack([laws, self.damping])
+        laws[is_single, 0] = laws[:, 3] = 0
+        self.constants["SPRUNG"] = int(laws.any())
+        self.reals["dof_law"] = laws if laws.any() else []
+        self.reals["rest"] = model.qpos_spring if laws.any() else []
         self.reals["dof_spring"] = model.qpos_spring[qpos]
         self.reals["dof_zero"] = model.qpos0[qpos]
         self.functions["dof_parent"] = model.dof_parentid

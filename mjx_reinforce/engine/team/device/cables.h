@@ -7,7 +7,7 @@
 // measures how far a place is along it, or how far a ball has turned; the angle of a ball.
 enum { COEFFICIENT, SEGMENT, WRENCH, APART, TWIST, ANGLE };
 
-// A rotation of less than half a turn as a vector (mju_quat2Vel).
+// A rotation of at most half a turn as a vector, by a quaternion of any length (mju_quat2Vel).
 DEV void rotation_vector(real* r, const real* quat) {
   const real sine = root(dot(quat + 1, quat + 1)), pi = real(3.14159265358979323846);
   real angle = 2 * atan2(sine, quat[0]);

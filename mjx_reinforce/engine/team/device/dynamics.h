@@ -42,13 +42,15 @@ DEV void actuate(const Team& t, const Model& M, State& s) {
   }
   if (NCABLE) t.sync();
   EACH(i, NV) {
-    real force = 0, drag = M.dof_damping[i];
+    const real damping =
+        M.dof_damping[i] + (SPRUNG ? polynomial_rate(M.dof_law[i].damping, fabs(s.qvel[i])) : real(0));
+    real force = 0, drag = damping;
     drive(M, s, i, s.qpos[M.dof_qpos[i]], s.qvel[i], force, drag);
     for (int n = 0; n < NCABLE; n++) force += s.cables[n].moment[i / 4].x[i % 4] * s.cables[n].force;
     if (ACTS_HELD && M.dof_acts_held[i]) force += compensation(M, s, i);
     const Range range = M.dof_force[i];
     const bool bounded = IMPLICIT == 1 || force <= range.low || force >= range.high;
-    if (IMPLICIT) s.drag[i] = bounded ? M.dof_damping[i] : drag;
+    if (IMPLICIT) s.drag[i] = bounded ? damping : drag;
     s.qfrc_actuator[i] = clip(force, range.low, range.high);
   }
 }

@@ -19,11 +19,32 @@ DEV real compensation(const Model& M, const State& s, int i) {
   return sum;
 }
 
+// What the higher powers of springs and dampers of joints push with, and springs of free and ball
+// joints altogether (of mj_springdamper).
+DEV real sprung(const Model& M, const State& s, int i) {
+  const Law& law = M.dof_law[i];
+  const int link = M.dof_link[i], kind = M.link_kind[link], k = i - M.link_dof[link];
+  const real *q = s.qpos + M.link_qpos[link], *rest = M.rest + M.link_qpos[link];
+  const real damped = -s.qvel[i] * polynomial(law.damping, fabs(s.qvel[i]));
+  if (kind > BALL) return damped - (*q - *rest) * polynomial(law.stiffness, *q - *rest);
+  real off[3];
+  if (kind == FREE && k < 3) {
+    for (int j = 0; j < 3; j++) off[j] = q[j] - rest[j];
+  } else {
+    if (kind == FREE) q += 3, rest += 3;
+    const real back[4] = {rest[0], -rest[1], -rest[2], -rest[3]};
+    real turned[4];
+    quat_times(turned, back, q);
+    rotation_vector(off, turned);
+  }
+  return damped - off[k % 3] * polynomial(law.stiffness, root(dot(off, off)));
+}
+
 // Leaves minus the forces in s.imbalance.
 DEV void passive(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
   EACH(i, NV) {
-    real force = 0;
+    real force = SPRUNG ? sprung(M, s, i) : real(0);
     if (NHELD && !M.dof_acts_held[i]) force += compensation(M, s, i);
     for (int n = 0; n < NCABLE && TENSE; n++) {
       const Cable& cable = s.cables[n];
