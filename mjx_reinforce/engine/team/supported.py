@@ -93,11 +93,6 @@ def _lacking_parts(model: Any) -> Iterable[tuple[str, Any]]:
     yield "tendons that yield", np.any(model.tendon_springyield)
     yield "tendons with a range of actuators' forces", np.any(model.tendon_actfrclimited)
     yield "joints that yield", np.any(model.jnt_springyield)
-    # MuJoCo integrates such bodies in a way of its own.
-    is_lone = np.bincount(model.dof_treeid, minlength=1) == 6
-    dofs = model.jnt_dofadr[model.jnt_type == FREE]
-    is_fast = model.opt.integrator == _C.mjtIntegrator.mjINT_IMPLICITFAST
-    yield "lone free bodies under implicitfast", is_fast and np.any(is_lone[model.dof_treeid[dofs]])
     active = model.eq_type[np.asarray(model.eq_active0, bool)]
     equalities = (_C.mjtEq.mjEQ_CONNECT, _C.mjtEq.mjEQ_JOINT)
     yield "equalities other than connect and joint", not np.isin(active, equalities).all()

@@ -40,6 +40,7 @@ _HEADERS = [
     "elimination",
     "newton",
     "report",
+    "lone",
     "integrators",
     "scalar",
     "launch",
@@ -243,6 +244,12 @@ class _Tables:
         self.functions["link_parent"] = self.parents
         self.functions["has_children"] = [int(x in self.parents) for x in range(model.njnt)]
         joints = np.flatnonzero(joint_kinds <= BALL)
+        # Free bodies without others in their tree, which implicitfast turns in a way of its own.
+        is_alone = np.bincount(model.dof_treeid, minlength=1)[model.dof_treeid] == 6
+        is_lone = (joint_kinds == FREE) & is_alone[model.jnt_dofadr]
+        lone_links = np.flatnonzero(is_lone) if self._implicit() == 2 else []
+        self.ints["lone_link"] = lone_links
+        self.constants["NLONE"] = len(lone_links)
         self.ints["turn_dof"] = model.jnt_dofadr[joints] + 3 * (joint_kinds[joints] == FREE)
         self.constants["NTURN"] = len(joints)
 

@@ -110,6 +110,7 @@ DEV void runge_kutta(const Team& t, const Model& M, State& s, bool last) {
 DEV void euler(const Team& t, const Model& M, State& s, bool last) {
   const int lane = t.lane;
   forward(t, M, s);
+  if (NLONE) turn_lone(t, M, s);
   const real* more = &s.direction[0].x[0];
   EACH(i, NV) s.qvel[i] += M.timestep * (s.qacc_warmstart[i] + (IMPLICIT ? more[i] : real(0)));
   t.sync();
