@@ -41,6 +41,10 @@ FIELDS = {
     "Loss": {"most": 1, "weight": 1},
     "Range": {"low": 1, "high": 1},
     "Friction": {"along": 5},
+    "Part": {"at": 3, "gear": 6},
+    "Tendon": {"stiffness": 3, "damping": 3, "rest": 2},
+    "Law": {"stiffness": 3, "damping": 3},
+    "Held": {"moment": 3, "mass": 1},
 }
 #: The structs of the tables whose rows are some.
 STRUCTS = {
@@ -53,6 +57,11 @@ STRUCTS = {
     "dof_loss": "Loss",
     "dof_force": "Range",
     "kind_friction": "Friction",
+    "part": "Part",
+    "tendon": "Tendon",
+    "bound": "Limit",
+    "dof_law": "Law",
+    "held": "Held",
 }
 
 

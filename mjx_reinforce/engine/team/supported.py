@@ -86,31 +86,22 @@ def _lacking_options(model: Any) -> Iterable[tuple[str, Any]]:
 
 def _lacking_parts(model: Any) -> Iterable[tuple[str, Any]]:
     """Yields what of bodies and constraints the device code lacks, and whether a model has it."""
-    is_scalar = np.isin(model.jnt_type, (HINGE, SLIDE))
     yield "no joints", not model.njnt
     yield f"more than {MAX_DOFS} degrees of freedom", model.nv > MAX_DOFS
     yield f"{_MAX_GEOMS} geoms or more", model.ngeom >= _MAX_GEOMS
     yield "flexes or plugins", model.nflex or model.nplugin
     yield "mocap bodies", model.nmocap
-    yield "gravity compensation", np.any(model.body_gravcomp)
-    # A tendon that only measures pushes nothing, and is no hindrance.
-    tendons = (
-        model.tendon_stiffness,
-        model.tendon_damping,
-        model.tendon_frictionloss,
-        model.tendon_limited,
-        model.tendon_armature,
-    )
-    yield "tendons that push", any(np.any(x) for x in tendons)
-    polynomials = (model.jnt_stiffnesspoly, model.dof_dampingpoly, model.jnt_springyield)
-    yield "polynomial springs or damping", any(np.any(x) for x in polynomials)
-    yield "springs of free or ball joints", np.any(model.jnt_stiffness[~is_scalar])
-    yield "limits of ball joints", np.any(model.jnt_limited[~is_scalar])
-    # MuJoCo integrates such bodies in a way of its own.
-    is_lone = np.bincount(model.dof_treeid, minlength=1) == 6
-    dofs = model.jnt_dofadr[model.jnt_type == FREE]
-    is_fast = model.opt.integrator == _C.mjtIntegrator.mjINT_IMPLICITFAST
-    yield "lone free bodies under implicitfast", is_fast and np.any(is_lone[model.dof_treeid[dofs]])
+    pulling = pulling_tendons(model)
+    wrap_tendons = np.repeat(np.arange(model.ntendon), model.tendon_num)
+    wraps = model.wrap_type[np.isin(wrap_tendons, pulling)]
+    wrapping = (_C.mjtWrap.mjWRAP_SPHERE, _C.mjtWrap.mjWRAP_CYLINDER)
+    yield "tendons that wrap geoms", np.isin(wraps, wrapping).any()
+    of_tendons = model.actuator_trntype == _C.mjtTrn.mjTRN_TENDON
+    armatures = (model.tendon_armature, model.actuator_armature[of_tendons])
+    yield "tendons with armature", any(np.any(x) for x in armatures)
+    yield "tendons that yield", np.any(model.tendon_springyield)
+    yield "tendons with a range of actuators' forces", np.any(model.tendon_actfrclimited)
+    yield "joints that yield", np.any(model.jnt_springyield)
     active = model.eq_type[np.asarray(model.eq_active0, bool)]
     equalities = (_C.mjtEq.mjEQ_CONNECT, _C.mjtEq.mjEQ_JOINT)
     yield "equalities other than connect and joint", not np.isin(active, equalities).all()
@@ -118,17 +109,23 @@ def _lacking_parts(model: Any) -> Iterable[tuple[str, Any]]:
 
 def _lacking_actuators(model: Any) -> Iterable[tuple[str, Any]]:
     """Yields what of actuators the device code lacks, and whether a model has it."""
-    is_of_joint = model.actuator_trntype == _C.mjtTrn.mjTRN_JOINT
-    yield "actuators of anything but joints", not is_of_joint.all()
-    joints = model.actuator_trnid[is_of_joint, 0]
-    is_scalar = np.isin(model.jnt_type[joints], (HINGE, SLIDE))
-    yield "actuators of free or ball joints", not is_scalar.all()
+    kinds = model.actuator_trntype
+    types = _C.mjtTrn
+    joint_types = (types.mjTRN_JOINT, types.mjTRN_JOINTINPARENT)
+    covered = (*joint_types, types.mjTRN_TENDON, types.mjTRN_SITE)
+    yield "actuators other than of joints, tendons and sites", not np.isin(kinds, covered).all()
+    is_relative = (kinds == types.mjTRN_SITE) & (model.actuator_trnid[:, 1] >= 0)
+    turns = model.actuator_gear[: len(kinds), 3:].any(1)
+    yield "actuators that turn a site against another one", np.any(is_relative & turns)
+    # MuJoCo takes the representative of their control that is nearest.
+    joints = np.where(np.isin(kinds, joint_types), model.actuator_trnid[:, 0], 0)
+    is_of_ball = np.isin(kinds, joint_types) & (model.jnt_type[joints] == BALL)
+    is_servo = model.actuator_gainprm[:, 0] == -model.actuator_biasprm[:, 1]
+    yield "servos of ball joints", np.any(is_of_ball & is_servo)
     gains = np.isin(model.actuator_gaintype, (_C.mjtGain.mjGAIN_FIXED, _C.mjtGain.mjGAIN_AFFINE))
     biases = np.isin(model.actuator_biastype, (_C.mjtBias.mjBIAS_NONE, _C.mjtBias.mjBIAS_AFFINE))
     yield "gains or biases other than fixed and affine", not (gains.all() and biases.all())
     yield "activations of actuators", model.na
-    inertias = (model.actuator_armature, model.actuator_damping, model.actuator_dampingpoly)
-    yield "actuators with armature or damping", any(np.any(x) for x in inertias)
     yield "delays of actuators", np.any(model.actuator_delay)
     yield "actuators of several controls", np.any(model.actuator_ctrlnum != 1)
 
@@ -145,6 +142,23 @@ def _lacking_contacts(model: Any) -> Iterable[tuple[str, Any]]:
         # A kind that is lacking does not get here: ``why`` stops at the first one.
         num_items += NUM_PARTS[kinds]
     yield f"more than {_MAX_ITEMS} possible contacts", num_items > _MAX_ITEMS
+
+
+def pulling_tendons(model: Any) -> list[int]:
+    """Returns the tendons that pull; one that only measures is no hindrance."""
+    is_pulled = np.zeros(model.ntendon, bool)
+    is_of_tendon = model.actuator_trntype == _C.mjtTrn.mjTRN_TENDON
+    is_pulled[model.actuator_trnid[is_of_tendon, 0]] = True
+    for field in (
+        model.tendon_stiffness,
+        model.tendon_stiffnesspoly.any(1),
+        model.tendon_damping,
+        model.tendon_dampingpoly.any(1),
+        model.tendon_frictionloss,
+        model.tendon_limited,
+    ):
+        is_pulled |= field != 0
+    return np.flatnonzero(is_pulled).tolist()
 
 
 def geom_kinds(model: Any, pair: GeomPair) -> tuple[int, int]:

@@ -15,7 +15,7 @@ import numpy as np
 from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.physics.early_stop import stops_early
 from mjx_reinforce.engine.scalar import UnsupportedPrimitive
-from mjx_reinforce.engine.team import flags, records, supported
+from mjx_reinforce.engine.team import cables, flags, records, supported
 from mjx_reinforce.engine.team.frames import Frame, Inertial, rotation, six, times
 from mjx_reinforce.engine.team.records import Softness
 from mjx_reinforce.engine.team.supported import (
@@ -40,10 +40,12 @@ _HEADERS = [
     "state",
     "block",
     "kinematics",
-    "dynamics",
     "impedance",
     "bounds",
     "cones",
+    "cables",
+    "passive",
+    "dynamics",
     "contact_rows",
     "rounds",
     "boxes",
@@ -55,6 +57,7 @@ _HEADERS = [
     "newton",
     "early_stop",
     "report",
+    "lone",
     "integrators",
     "scalar",
     "launch",
@@ -144,8 +147,11 @@ class _Tables:
         self._links()
         self._bodies()
         self._dofs()
+        self._held()
+        self._cables()
         self._actuators()
         self._equalities()
+        self._cable_bounds()
         self._pairs(num_near)
         self._jumps()
         self._search()
@@ -155,6 +161,8 @@ class _Tables:
         self.constants["NB"] = model.nbody
         self.constants["NU"] = max(model.nu, 1)
         self.constants["IMPLICIT"] = self._implicit()
+        is_passive = any(self.constants[x] for x in ("NHELD", "TENSE", "SPRUNG"))
+        self.constants["PASSIVE"] = int(is_passive)
         self.constants["RK4"] = int(model.opt.integrator == _C.mjtIntegrator.mjINT_RK4)
         self.constants["ELLIPTIC"] = self._is_elliptic()
         self.constants["ANY_POWER"] = int(any(x.power != 2 for x in self.soft))
@@ -174,6 +182,7 @@ class _Tables:
             lines.append(f"  constexpr int table[] = {{{table}}};\n  return table[i];\n}}")
         lines.append("struct Model {")
         lines.append("  real timestep, smallest_gain;")
+        empty = []
         # In float32 a step that lowers the cost by less is rounding; in float64 the search goes on
         # until no row changes. The cost of an elliptic cone that slides is not quadratic, and no
         # step is the last by itself: in float32 one of a tenth of C's tolerance is, in float64 one
@@ -190,12 +199,17 @@ class _Tables:
             ("real", lambda x: f"real({float(x)!r})", self.reals),
         ):
             for name, values in arrays.items():
-                entries = np.asarray(values).ravel().tolist() or [0]  # C++ has no empty array
+                entries = np.asarray(values).ravel().tolist()
                 struct = records.STRUCTS.get(name, type_name)
+                if not entries:
+                    empty.append(f"{struct} {name}[1];")
+                    continue
                 row_size = records.size(struct)
                 lines.append(f"  {struct} {name}[{-(-len(entries) // row_size)}];")
                 initial_values.append("{" + ",".join(map(literal, entries)) + "}")
-        lines.append("};")
+        # C++ has no empty array: those that are share a place.
+        lines += [f"  union {{ int none; {' '.join(empty)} }};", "};"]
+        initial_values.append("{0}")
         lines += records.checks()
         lines.append("#define MODEL_INIT {" + ",\\\n".join(initial_values) + "}")
         return "\n".join(lines)
@@ -222,7 +236,7 @@ class _Tables:
             return 2
         is_euler = opt.integrator == _C.mjtIntegrator.mjINT_EULER
         is_implicit = is_euler and not flags.is_off(self.model, "eulerdamp")
-        return int(is_implicit and self.model.dof_damping.any())
+        return int(is_implicit and self.damping.any())
 
     def _records(self, name: str, order: Any = slice(None), **columns: np.ndarray) -> None:
         """Makes a table of structs from the columns of their fields, [rows] or [rows, numbers]."""
@@ -276,6 +290,12 @@ class _Tables:
         self.functions["link_parent"] = self.parents
         self.functions["has_children"] = [int(x in self.parents) for x in range(model.njnt)]
         joints = np.flatnonzero(joint_kinds <= BALL)
+        # Free bodies without others in their tree, which implicitfast turns in a way of its own.
+        is_alone = np.bincount(model.dof_treeid, minlength=1)[model.dof_treeid] == 6
+        is_lone = (joint_kinds == FREE) & is_alone[model.jnt_dofadr]
+        lone_links = np.flatnonzero(is_lone) if self._implicit() == 2 else []
+        self.ints["lone_link"] = lone_links
+        self.constants["NLONE"] = len(lone_links)
         self.ints["turn_dof"] = model.jnt_dofadr[joints] + 3 * (joint_kinds[joints] == FREE)
         self.constants["NTURN"] = len(joints)
 
@@ -314,6 +334,23 @@ class _Tables:
         self.reals["link_com"] = [x.com for x in links]
         self.reals["link_inertia"] = [six(x.inertia) for x in links]
 
+    def _held(self) -> None:
+        """Makes the tables of what gravity compensation holds, a row a link."""
+        model = self.model
+        held_masses = model.body_mass * model.body_gravcomp
+        held_links: dict[int, np.ndarray] = {}
+        for frame, mass, ipos in zip(self.frames, held_masses, model.body_ipos, strict=True):
+            if mass and frame.link >= 0:
+                row = mass * np.array([*frame.place(ipos), 1])
+                held_links[frame.link] = held_links.get(frame.link, 0) + row
+        self.ints["held_link"] = list(held_links)
+        self.reals["held"] = list(held_links.values())
+        # Of these joints the actuators' force includes it; without an actuator there is none.
+        acts = np.asarray(model.jnt_actgravcomp, bool)[self.dof_joint] & bool(held_links)
+        self.ints["dof_acts_held"] = acts if held_links else []
+        self.constants["NHELD"] = len(held_links)
+        self.constants["ACTS_HELD"] = int(acts.any() and model.nu > 0)
+
     def _dofs(self) -> None:
         """Makes the tables of degrees of freedom."""
         model = self.model
@@ -333,9 +370,20 @@ class _Tables:
         self.ints["dof_qpos"] = qpos
         self.ints["dof_turns"] = ~is_single & ~(dof_kinds == _SHIFTS_IN_THE_WORLD)
         self.reals["dof_axis"] = axes
-        self.reals["dof_damping"] = model.dof_damping
-        self.reals["dof_armature"] = model.dof_armature
+        joint_types = (_C.mjtTrn.mjTRN_JOINT, _C.mjtTrn.mjTRN_JOINTINPARENT)
+        inherited = cables.of_actuators(model, joint_types, model.njnt)[joint]
+        self.damping = np.column_stack([model.dof_damping, model.dof_dampingpoly])
+        self.damping += inherited[:, 1:]
+        self.reals["dof_damping"] = self.damping[:, 0]
+        self.reals["dof_armature"] = model.dof_armature + inherited[:, 0]
         self.reals["dof_stiffness"] = np.where(is_single, model.jnt_stiffness[joint], 0)
+        # Beyond these: higher powers, and the springs of free and ball joints.
+        laws = np.column_stack([model.jnt_stiffness, model.jnt_stiffnesspoly])[joint]
+        laws = np.hstack([laws, self.damping])
+        laws[is_single, 0] = laws[:, 3] = 0
+        self.constants["SPRUNG"] = int(laws.any())
+        self.reals["dof_law"] = laws if laws.any() else []
+        self.reals["rest"] = model.qpos_spring if laws.any() else []
         self.reals["dof_spring"] = model.qpos_spring[qpos]
         self.reals["dof_zero"] = model.qpos0[qpos]
         self.functions["dof_parent"] = model.dof_parentid
@@ -420,11 +468,61 @@ class _Tables:
         softness = Softness(stiffness, damping, dmin, dmax - dmin, width, midpoint, power)
         return self.soft.setdefault(Softness(*map(float, softness)), len(self.soft))
 
+    def _cables(self) -> None:
+        """Makes the tables of cables."""
+        model = self.model
+        self.cables = cables.of_model(model, self.frames, self.parents, self.reals["link_quat"])
+        parts = [part for cable in self.cables for part in cable.parts]
+        self.ints["cable_part"] = np.cumsum([0, *(len(x.parts) for x in self.cables)])
+        self.ints["part_kind"] = [x.kind for x in parts]
+        self.ints["part_on"] = [self._link_number(x.on) for x in parts]
+        self.ints["part_off"] = [self._link_number(x.off) for x in parts]
+        self.ints["part_body"] = [x.bodies for x in parts]
+        self.constants["SEGMENTS"] = int(any(x.kind == cables.SEGMENT for x in parts))
+        self.ints["part_frame"] = [self._link_number(x.frame) for x in parts]
+        self.reals["part"] = [(*x.at, *x.gear) for x in parts]
+        tendons = [cables.spring(model, x.tendon) for x in self.cables]
+        self.constants["TENSE"] = int(any(any(x.stiffness + x.damping) for x in tendons))
+        self.reals["tendon"] = [sum(x, ()) for x in tendons] if self.constants["TENSE"] else []
+        self.constants["NCABLE"] = len(self.cables)
+
+    def _cable_bounds(self) -> None:
+        """Makes the tables of limits and, behind them, of friction loss of cables."""
+        limits = cables.limits(self.model, self.cables)
+        losses = cables.losses(self.model, self.cables)
+        rows = [*limits, *losses]
+        self.ints["bound_cable"] = [x.cable for x in rows]
+        self.ints["bound_soft"] = [self._soft(x.solref, x.solimp) for x in rows]
+        self.ints["bound_sides"] = [x.sides for x in limits]
+        self.reals["bound"] = [(*x.range, x.margin, x.weight) for x in rows]
+        self.reals["bound_loss"] = [x.loss for x in losses]
+        self.constants["NLIMITED"] = len(limits)
+        self.constants["NLOSS"] = len(losses)
+        self.constants["NE"] += len(rows)
+
+    def _targets(self) -> np.ndarray:
+        """Returns what actuators drive: a degree of freedom, or the number of a cable after all."""
+        model = self.model
+        of_tendons = {x.tendon: n for n, x in enumerate(self.cables)}
+        of_actuators = {x.actuator: n for n, x in enumerate(self.cables)}
+        targets = []
+        for actuator, (number, _) in enumerate(model.actuator_trnid):
+            if actuator in of_actuators:
+                targets.append(model.nv + of_actuators[actuator])
+            elif model.actuator_trntype[actuator] == _C.mjtTrn.mjTRN_TENDON:
+                targets.append(model.nv + of_tendons[number])
+            else:
+                targets.append(model.jnt_dofadr[number])
+        return np.array(targets, int)
+
     def _actuators(self) -> None:
         """Makes the tables of actuators, in the order of the degrees of freedom that they move."""
         model = self.model
-        dofs = model.jnt_dofadr[model.actuator_trnid[:, 0]]
-        order = np.argsort(dofs, kind="stable")
+        targets = self._targets()
+        gear = model.actuator_gear[:, 0].copy()
+        # The moments of an actuator's own cable have its gear.
+        gear[[x.actuator for x in self.cables if x.actuator >= 0]] = 1
+        order = np.argsort(targets, kind="stable")
         no_range = (-_NO_LIMIT, _NO_LIMIT)
         controls = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, no_range)
         forces = np.where(model.actuator_forcelimited[:, None], model.actuator_forcerange, no_range)
@@ -436,7 +534,7 @@ class _Tables:
         self._records(
             "actuator",
             order,
-            gear=model.actuator_gear[:, 0],
+            gear=gear,
             control_low=controls[:, 0],
             control_high=controls[:, 1],
             gain=gain[:, 0],
@@ -449,8 +547,9 @@ class _Tables:
             gain_by_speed=gain[:, 2],
         )
         self.ints["actuator_ctrl"] = model.actuator_ctrladr[order]
-        # Those of a degree of freedom are from its entry up to the next one's.
-        self.ints["dof_actuator"] = np.searchsorted(dofs[order], np.arange(model.nv + 1))
+        # Those of a degree of freedom or a cable are from its entry up to the next one's.
+        counts = np.arange(model.nv + len(self.cables) + 1)
+        self.ints["target_actuator"] = np.searchsorted(targets[order], counts)
         joint = self.dof_joint
         is_limited = model.jnt_actfrclimited[joint, None]
         bounds = np.where(is_limited, model.jnt_actfrcrange[joint], no_range)

@@ -63,12 +63,13 @@ def _model(
     first: str = "",
     second: str = 'axis="0 1 0"',
     actuator: str = "",
+    body: str = "",
     **parts: str,
 ) -> Any:
     """Returns the model of parts as models.toml has them."""
     geoms = 'contype="0"' if bodies is None else ""
     if bodies is None:
-        world = _MODELS["arm"].format(first=first, second=second)
+        world = _MODELS["arm"].format(first=first, second=second, body=body)
     for n, geom in enumerate(bodies or ()):
         at, turned = f"{0.17 * n} {0.03 * n} {height}", f"{20 * n} 25 {40 * n}"
         world += f'<body pos="{at}" euler="{turned}"><freejoint/><geom {geom}/></body>'
@@ -171,6 +172,21 @@ def test_features(feature, tmp_path):
 def test_a_search_that_stops_early_ends_where_c_ends(limits, tmp_path):
     m = _model(**_MODELS["early"][limits])
     assert _largest_error(m, tmp_path, skip=3, starts=3) < 1e-9
+
+
+@needs_compiler
+@pytest.mark.parametrize("lanes", [2, 8])
+@pytest.mark.parametrize(
+    "feature",
+    [
+        "spatial tendons",
+        "limits and friction loss of tendons",
+        "a tendon between two trees, implicitfast",
+    ],
+)
+def test_lanes_share_cables(feature, lanes, tmp_path):
+    m = _model(**_MODELS["features"][feature])
+    assert _largest_error(m, tmp_path, skip=3, starts=1, lanes=lanes) < 1e-9
 
 
 @needs_compiler

@@ -13,26 +13,44 @@ DEV void along_tree(const real* value, const Quad* by, real* out, int width) {
   }
 }
 
+// Adds the force of the actuators of a degree of freedom or, after all of these, of a cable, and
+// how much they damp.
+DEV void drive(const Model& M, const State& s, int target, real position, real velocity,
+               real& force, real& drag) {
+  LOOP for (int a = M.target_actuator[target]; a < M.target_actuator[target + 1]; a++) {
+    const Actuator& p = M.actuator[a];
+    const real length = p.gear * position, speed = p.gear * velocity;
+    const real control = clip(s.ctrl[M.actuator_ctrl[a]], p.control_low, p.control_high);
+    const real gain = p.gain + p.gain_by_length * length + p.gain_by_speed * speed;
+    const real push =
+        gain * control + p.bias + p.bias_by_length * length + p.bias_by_speed * speed;
+    force += p.gear * clip(push, p.force_low, p.force_high);
+    // A force at its bound does not change with the speed: it damps nothing.
+    if (IMPLICIT == 2 && push > p.force_low && push < p.force_high)
+      drag -= p.gear * p.gear * (p.bias_by_speed + p.gain_by_speed * control);
+  }
+}
 // Forces of actuators, and how much they damp (mj_fwdActuation).
 DEV void actuate(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
+  EACH(n, NCABLE) {
+    Cable& cable = s.cables[n];
+    real force = 0, drag = TENSE ? polynomial_rate(M.tendon[n].damping, fabs(cable.speed)) : real(0);
+    drive(M, s, NV + n, cable.length, cable.speed, force, drag);
+    cable.force = force;
+    cable.drag = drag;
+  }
+  if (NCABLE) t.sync();
   EACH(i, NV) {
-    real force = 0, drag = M.dof_damping[i];
-    LOOP for (int a = M.dof_actuator[i]; a < M.dof_actuator[i + 1]; a++) {
-      const Actuator& p = M.actuator[a];
-      const real length = p.gear * s.qpos[M.dof_qpos[i]], speed = p.gear * s.qvel[i];
-      const real control = clip(s.ctrl[M.actuator_ctrl[a]], p.control_low, p.control_high);
-      const real gain = p.gain + p.gain_by_length * length + p.gain_by_speed * speed;
-      const real push =
-          gain * control + p.bias + p.bias_by_length * length + p.bias_by_speed * speed;
-      force += p.gear * clip(push, p.force_low, p.force_high);
-      // A force at its bound does not change with the speed: it damps nothing.
-      if (IMPLICIT == 2 && push > p.force_low && push < p.force_high)
-        drag -= p.gear * p.gear * (p.bias_by_speed + p.gain_by_speed * control);
-    }
+    const real damping =
+        M.dof_damping[i] + (SPRUNG ? polynomial_rate(M.dof_law[i].damping, fabs(s.qvel[i])) : real(0));
+    real force = 0, drag = damping;
+    drive(M, s, i, s.qpos[M.dof_qpos[i]], s.qvel[i], force, drag);
+    for (int n = 0; n < NCABLE; n++) force += s.cables[n].moment[i / 4].x[i % 4] * s.cables[n].force;
+    if (ACTS_HELD && M.dof_acts_held[i]) force += compensation(M, s, i);
     const Range range = M.dof_force[i];
     const bool bounded = IMPLICIT == 1 || force <= range.low || force >= range.high;
-    if (IMPLICIT) s.drag[i] = bounded ? M.dof_damping[i] : drag;
+    if (IMPLICIT) s.drag[i] = bounded ? damping : drag;
     s.qfrc_actuator[i] = clip(force, range.low, range.high);
   }
 }
@@ -113,6 +131,7 @@ DEV void forces_and_inertia(const Team& t, const Model& M, State& s) {
     real imbalance =
         dot6(force, moves) + armature * s.qacc_warmstart[i] + M.dof_damping[i] * s.qvel[i];
     imbalance += M.dof_stiffness[i] * (s.qpos[M.dof_qpos[i]] - M.dof_spring[i]);
+    if (PASSIVE) imbalance += s.imbalance[i];
     s.imbalance[i] = imbalance - s.qfrc_actuator[i];
   }
   t.sync();

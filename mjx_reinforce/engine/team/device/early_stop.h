@@ -58,6 +58,19 @@ DEV void add_contact(const Model& M, const Contact& c, Work& sum) {
   });
 }
 
+DEV void add_general(const Model& M, const State& s, int e, Work& sum) {
+  const int n = e - (NE - NLIMITED - NLOSS);
+  const real mass = s.general_constraint_mass[e];
+  const real residual = s.general_residual[e], change = s.general_change[e];
+  if (n < 0) {
+    sum.add(mass, residual, change, true, true);
+  } else if (n < NLIMITED) {
+    if (mass > 0) sum.add_one_sided(mass, residual, change);
+  } else {
+    sum.add_bounded(mass, M.bound_loss[n - NLIMITED], residual, change);
+  }
+}
+
 // A step of the search: its slope and curvature without rows.
 struct Step { real slope, curvature; };
 
@@ -68,8 +81,7 @@ DEV Mark mark_at(const Team& t, const Model& M, State& s, const Search& search, 
   each_contact(t, s, [&](Contact& c) { add_contact(M, c, sum); });
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
     search.bounds[r].work(search.qacc[r], search.direction[r], sum);
-  EACH(e, NE)
-    sum.add(s.general_constraint_mass[e], s.general_residual[e], s.general_change[e], true, true);
+  EACH(e, NE) add_general(M, s, e, sum);
   const real curvature = step.curvature + t.sum(sum.curvature);
   return {length, length * (step.slope + length * step.curvature / 2) + t.sum(sum.cost),
           step.slope + length * step.curvature + t.sum(sum.slope),
@@ -143,13 +155,14 @@ DEV void subtract_forces(const Team& t, const Model& M, State& s, real (&gradien
       }
     }
   });
-  for (int e = 0; e < NE; e++)
+  for (int e = 0; e < NE; e++) {
+    real stiffness;
+    const real force = general_force(M, s, e, stiffness);
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
       const int i = t.lane + r * W;
-      if (i < NV)
-        gradient[r] += s.general[e][i / 4].x[i % 4] * s.general_constraint_mass[e] *
-                       s.general_residual[e];
+      if (i < NV) gradient[r] -= s.general[e][i / 4].x[i % 4] * force;
     }
+  }
 }
 
 // As begin_step. A search that stops early leaves a gradient, of which implicit damping takes part.
@@ -187,6 +200,7 @@ DEV int newton_as_c(const Team& t, const Model& M, State& s) {
     load_rows(t, s, h);
     if (damps) {
       subtract_forces(t, M, s, search.gradient);
+      if (IMPLICIT == 2 && NCABLE) damp_cables(t, M, s, search.qacc, search.gradient, h);
     } else if (!starts) {
       add_rows(t, M, s, h, search.gradient);
     }

@@ -47,7 +47,7 @@ DEV void connect_rows(const Team& t, const Model& M, State& s, int n) {
 
 DEV void joint_rows(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
-  EACH(n, NE - 3 * NCONNECT) {
+  EACH(n, NE - NLIMITED - NLOSS - 3 * NCONNECT) {
     const int e = 3 * NCONNECT + n, first = M.joined_dof[2 * n], second = M.joined_dof[2 * n + 1];
     const real* p = M.joined_poly + 5 * n;
     const Softness& soft = M.soft[M.joined_soft[n]];
@@ -71,5 +71,6 @@ DEV void joint_rows(const Team& t, const Model& M, State& s) {
 DEV void general_rows(const Team& t, const Model& M, State& s) {
   for (int n = 0; n < NCONNECT; n++) connect_rows(t, M, s, n);
   joint_rows(t, M, s);
+  bound_rows(t, M, s);
   t.sync();
 }

@@ -12,6 +12,8 @@ DEV int forward(const Team& team, const Model& M, State& s) {
   place_dofs(t, M, s);
   place_inertias(t, M, s);
   place_geoms(t, M, s);
+  if (NCABLE) place_cables(t, M, s);
+  if (PASSIVE) passive(t, M, s);
   actuate(t, M, s);
   t.sync();
   motions(t, M, s);
@@ -108,6 +110,7 @@ DEV void runge_kutta(const Team& t, const Model& M, State& s, bool last) {
 DEV void euler(const Team& t, const Model& M, State& s, bool last) {
   const int lane = t.lane;
   forward(t, M, s);
+  if (NLONE) turn_lone(t, M, s);
   const real* more = &s.direction[0].x[0];
   EACH(i, NV) s.qvel[i] += M.timestep * (s.qacc_warmstart[i] + (IMPLICIT ? more[i] : real(0)));
   t.sync();

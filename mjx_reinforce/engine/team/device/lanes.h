@@ -16,6 +16,7 @@ typedef float real;
 #define REAL double
 #endif
 typedef REAL real;
+using std::atan2;
 using std::fabs;
 using std::memcpy;
 using std::pow;
@@ -29,6 +30,16 @@ using std::sqrt;
 
 // Four numbers that are loaded and stored at once.
 struct alignas(4 * sizeof(real)) Quad { real x[4]; };
+
+// So many items, or no place at all.
+template <class T, int COUNT> struct Some {
+  T items[COUNT];
+  DEV T& operator[](int i) { return items[i]; }
+  DEV const T& operator[](int i) const { return items[i]; }
+};
+template <class T> struct Some<T, 0> {
+  DEV T& operator[](int) const { return *reinterpret_cast<T*>(size_t(this)); }
+};
 
 constexpr bool SINGLE = sizeof(real) == 4;
 

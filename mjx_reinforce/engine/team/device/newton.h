@@ -106,8 +106,8 @@ DEV void add_rows(const Team& t, const Model& M, State& s, real (&h)[ROWS_A_LANE
     }
   });
   LOOP for (int e = 0; e < NE; e++) {
-    const real constraint_mass = s.general_constraint_mass[e];
-    const real force = -constraint_mass * s.general_residual[e];
+    real constraint_mass;
+    const real force = general_force(M, s, e, constraint_mass);
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
       const int i = t.lane + r * W;
       const real entry = i < SIDE ? s.general[e][i / 4].x[i % 4] : real(0);
@@ -156,6 +156,7 @@ DEV Bend bend_at(const Team& t, const Model& M, State& s, const Search& search, 
   each_contact(t, s, [&](Contact& c) { bend(M, c, length, sum); });
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
     search.bounds[r].bend(search.qacc[r], search.direction[r], length, sum);
+  bend_bounds(t, M, s, length, sum);
   return sum;
 }
 
@@ -205,13 +206,17 @@ DEV void follow(const Team& t, const Model& M, State& s, Search& search, real le
     }
   });
   t.sync();
-  for (int e = 0; e < NE; e++)
+  for (int e = 0; e < NE; e++) {
+    real stiffness;
+    general_force(M, s, e, stiffness);
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
       const int i = t.lane + r * W;
       if (i < NV)
-        search.imbalance[r] -= length * s.general_constraint_mass[e] * s.general_change[e] *
-                               s.general[e][i / 4].x[i % 4];
+        search.imbalance[r] -=
+            length * stiffness * s.general_change[e] * s.general[e][i / 4].x[i % 4];
     }
+  }
+  if (NLIMITED + NLOSS) t.sync();  // before the residuals, which say what pushes, change
 }
 
 // Replaces s.qacc_warmstart by the acceleration (MuJoCo's mj_solNewton); if damping is implicit,
@@ -231,6 +236,7 @@ DEV int newton(const Team& t, const Model& M, State& s) {
     t.sync();
     load_rows(t, s, h);
     if (!damps) add_rows(t, M, s, h, search.gradient);
+    if (damps && IMPLICIT == 2 && NCABLE) damp_cables(t, M, s, search.qacc, search.gradient, h);
     load_right_side(t, s, search, h);
     solve(t, s, h, search.direction);
     if (damps) break;

@@ -37,5 +37,13 @@ struct Limit { real range[2], margin, weight; };
 // The most that friction loss pushes, and the inverse mass of its row.
 struct Loss { real most, weight; };
 struct Range { real low, high; };
+// A part of a cable: a place, and a force and a torque; see cables.py.
+struct Part { real at[3], gear[6]; };
+// The polynomials of a tendon's spring and damper, and the lengths between which it is slack.
+struct Tendon { real stiffness[3], damping[3], rest[2]; };
+// The same of a degree of freedom.
+struct Law { real stiffness[3], damping[3]; };
+// What gravity compensation holds of a link: the mass times its place in the link's frame, the mass.
+struct Held { real moment[3], mass; };
 // Along the two tangents, about the normal, about the two tangents.
 struct Friction { real along[5]; };

@@ -13,7 +13,7 @@ DEV void add_external(State& s, int b, real sign, const real* force, const real*
   }
 }
 
-// cfrc_ext of contacts and connect constraints (MuJoCo's mj_rnePostConstraint). A lane has a body.
+// cfrc_ext of contacts, connect constraints and spatial tendons (MuJoCo's mj_rnePostConstraint). A lane has a body.
 DEV void external_forces(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
   EACH(n, 6 * NB) s.cfrc_ext[n] = 0;
@@ -45,6 +45,19 @@ DEV void external_forces(const Team& t, const Model& M, State& s) {
       s.pose[M.connect_link[2 * n + side]].place(at, M.connect_at + 6 * n + 3 * side);
       for (int k = 0; k < 3; k++) at[k] -= s.pose[0].origin(k);
       if (b > 0 && b % W == lane) add_external(s, b, side ? -1 : 1, force, none, at);
+    }
+  }
+  for (int n = 0; n < NCABLE && SEGMENTS; n++) {
+    const real pull = whole_force(M, s, n), none[3] = {};
+    for (int p = M.cable_part[n]; p < M.cable_part[n + 1]; p++) {
+      if (M.part_kind[p] != SEGMENT) continue;
+      real ends[2][3], force[3];
+      segment(M, s, p, ends, force);
+      for (int k = 0; k < 3; k++) force[k] *= pull;
+      for (int side = 0; side < 2; side++) {
+        const int b = M.part_body[2 * p + side];
+        if (b > 0 && b % W == lane) add_external(s, b, side ? -1 : 1, force, none, ends[side]);
+      }
     }
   }
 }

@@ -50,6 +50,13 @@ struct Contact {
   int item;
 };
 
+// A cable of cables.h: what it pulls at, how long it is, and how that changes by qvel and by
+// qacc_warmstart; the force of its actuators, and how much it damps implicitly.
+struct Cable {
+  Quad moment[QUADS];
+  real length, speed, acceleration, force, drag;
+};
+
 struct alignas(4 * sizeof(real)) State {
   real qpos[padded(NQ)], qvel[padded(NV)], qacc_warmstart[padded(NV)];
   real qfrc_actuator[padded(NV)], ctrl[padded(NU)], act[1], time[1];
@@ -62,9 +69,9 @@ struct alignas(4 * sizeof(real)) State {
   real drag[IMPLICIT ? NV : 1];  // what damps implicitly
   real start_qpos[RK4 ? NQ : 1], start_qvel[RK4 ? NV : 1];
   real sum_qvel[RK4 ? NV : 1], sum_qacc[RK4 ? NV : 1], turning[RK4 && NTURN ? 3 * NTURN : 1];
-  Quad general[NE ? NE : 1][NE ? QUADS : 1];  // J of rows of no contact and no single dof
-  real general_residual[NE ? NE : 1], general_change[NE ? NE : 1];
-  real general_constraint_mass[NE ? NE : 1];
+  Some<Quad[QUADS], NE> general;  // J of rows of no contact and no single dof
+  Some<real, NE> general_residual, general_change, general_constraint_mass;
+  Some<Cable, NCABLE> cables;
   union {
     Quad rows[SIDE][QUADS];  // below the diagonal M, above it what eliminates
     Quad subtree[NL][5];     // inertia [10], force [6]
