@@ -72,7 +72,10 @@ def _lacking_options(model: Any) -> Iterable[tuple[str, Any]]:
     flags = opt.disableflags | opt.enableflags | opt.disableactuator
     yield "flags that disable or enable parts of the physics", flags
     yield "noslip iterations", opt.noslip_iterations
-    yield "a medium with density or viscosity", opt.density or opt.viscosity
+    has_medium = opt.density > 0 or opt.viscosity > 0
+    is_fast = opt.integrator == types.mjINT_IMPLICITFAST
+    yield "a medium under implicitfast", has_medium and is_fast
+    yield "ellipsoids in a medium", has_medium and np.any(model.geom_fluid[:, 0])
 
 
 def _lacking_parts(model: Any) -> Iterable[tuple[str, Any]]:
