@@ -44,6 +44,14 @@ FIELDS = {
     "Part": {"at": 3, "gear": 6},
     "Tendon": {"stiffness": 3, "damping": 3, "rest": 2},
     "Law": {"stiffness": 3, "damping": 3},
+    "Wet": {
+        "at": 3,
+        "axes": 9,
+        "viscous_torque": 1,
+        "viscous_force": 1,
+        "drag_torque": 3,
+        "drag_force": 3,
+    },
     "Held": {"moment": 3, "mass": 1},
 }
 #: The structs of the tables whose rows are some.
@@ -61,6 +69,7 @@ STRUCTS = {
     "tendon": "Tendon",
     "bound": "Limit",
     "dof_law": "Law",
+    "wet": "Wet",
     "held": "Held",
 }
 

@@ -81,7 +81,10 @@ def _lacking_options(model: Any) -> Iterable[tuple[str, Any]]:
     yield f"{limits} under Runge-Kutta", is_early and opt.integrator == types.mjINT_RK4
     yield "flags that enable parts of the physics", flags.enabled_physics(model)
     yield "noslip iterations", opt.noslip_iterations
-    yield "a medium with density or viscosity", opt.density or opt.viscosity
+    has_medium = opt.density > 0 or opt.viscosity > 0
+    is_fast = opt.integrator == types.mjINT_IMPLICITFAST
+    yield "a medium under implicitfast", has_medium and is_fast
+    yield "ellipsoids in a medium", has_medium and np.any(model.geom_fluid[:, 0])
 
 
 def _lacking_parts(model: Any) -> Iterable[tuple[str, Any]]:

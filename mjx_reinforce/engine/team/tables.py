@@ -148,6 +148,7 @@ class _Tables:
         self._bodies()
         self._dofs()
         self._held()
+        self._medium()
         self._cables()
         self._actuators()
         self._equalities()
@@ -290,12 +291,6 @@ class _Tables:
         self.functions["link_parent"] = self.parents
         self.functions["has_children"] = [int(x in self.parents) for x in range(model.njnt)]
         joints = np.flatnonzero(joint_kinds <= BALL)
-        # Free bodies without others in their tree, which implicitfast turns in a way of its own.
-        is_alone = np.bincount(model.dof_treeid, minlength=1)[model.dof_treeid] == 6
-        is_lone = (joint_kinds == FREE) & is_alone[model.jnt_dofadr]
-        lone_links = np.flatnonzero(is_lone) if self._implicit() == 2 else []
-        self.ints["lone_link"] = lone_links
-        self.constants["NLONE"] = len(lone_links)
         self.ints["turn_dof"] = model.jnt_dofadr[joints] + 3 * (joint_kinds[joints] == FREE)
         self.constants["NTURN"] = len(joints)
 
@@ -351,6 +346,42 @@ class _Tables:
         self.constants["NHELD"] = len(held_links)
         self.constants["ACTS_HELD"] = int(acts.any() and model.nu > 0)
 
+    def _medium(self) -> None:
+        """Makes the tables of what a medium does to bodies, in the order of their links."""
+        model = self.model
+        opt = model.opt
+        links = np.array([self._link_number(x.link) for x in self.frames])
+        bodies = np.flatnonzero((model.body_mass >= _MIN_VALUE) & (links < model.njnt))
+        bodies = bodies[np.argsort(links[bodies], kind="stable")]
+        has_medium = opt.density > 0 or opt.viscosity > 0
+        self.constants["MEDIUM"] = int(has_medium)
+        self.ints["link_wet"] = []
+        self.reals |= {"wet": [], "wind": []}
+        if not has_medium:
+            return
+        # A body is a box of the same inertia, or, where the medium is viscous, a ball.
+        inertia = model.body_inertia[bodies]
+        squares = inertia.sum(1, keepdims=True) - 2 * inertia
+        masses = model.body_mass[bodies, None]
+        box = np.sqrt(np.maximum(_MIN_VALUE, squares) / masses * 6)
+        diameter = box.mean(1)
+        others = box[:, [[1, 2], [0, 2], [0, 1]]]
+        turns = [
+            rotation(self.frames[x].then(model.body_ipos[x], model.body_iquat[x]).quat).T
+            for x in bodies
+        ]
+        self._records(
+            "wet",
+            at=np.array([self.frames[x].place(model.body_ipos[x]) for x in bodies]),
+            axes=np.array(turns),
+            viscous_torque=np.pi * opt.viscosity * diameter**3,
+            viscous_force=3 * np.pi * opt.viscosity * diameter,
+            drag_torque=opt.density / 64 * box * (others**4).sum(2),
+            drag_force=opt.density / 2 * others.prod(2),
+        )
+        self.ints["link_wet"] = np.searchsorted(links[bodies], np.arange(model.njnt + 1))
+        self.reals["wind"] = opt.wind
+
     def _dofs(self) -> None:
         """Makes the tables of degrees of freedom."""
         model = self.model
@@ -386,6 +417,12 @@ class _Tables:
         self.reals["rest"] = model.qpos_spring if laws.any() else []
         self.reals["dof_spring"] = model.qpos_spring[qpos]
         self.reals["dof_zero"] = model.qpos0[qpos]
+        # Free bodies without others in their tree, which implicitfast turns in a way of its own.
+        is_alone = np.bincount(model.dof_treeid, minlength=1)[model.dof_treeid] == 6
+        is_lone = (model.jnt_type == FREE) & is_alone[model.jnt_dofadr]
+        lone_links = np.flatnonzero(is_lone) if self._implicit() == 2 else []
+        self.ints["lone_link"] = lone_links
+        self.constants["NLONE"] = len(lone_links)
         self.functions["dof_parent"] = model.dof_parentid
         self.functions["last_of_link"] = np.where(np.diff(joint, append=-1), joint, -1)
         self._chains(dof_kinds)

@@ -97,6 +97,7 @@ DEV void forces_and_inertia(const Team& t, const Model& M, State& s) {
     inertia_times(force, inertia, a);
     inertia_times(momentum, inertia, v);
     cross_force(a, v, momentum);
+    if (MEDIUM) subtract_medium(M, s, l, a);
     for (int k = 0; k < 6; k++) whole[l][10 + k] = force[k] + a[k];
   }
   t.sync();

@@ -40,6 +40,32 @@ DEV real sprung(const Model& M, const State& s, int i) {
   return damped - off[k % 3] * polynomial(law.stiffness, root(dot(off, off)));
 }
 
+// Subtracts from a link's force, about the point of reference, what a medium pushes its bodies with
+// (mj_inertiaBoxFluidModel).
+DEV void subtract_medium(const Model& M, const State& s, int link, real* force) {
+  const real* v = s.velocity[link];
+  LOOP for (int b = M.link_wet[link]; b < M.link_wet[link + 1]; b++) {
+    const Wet& wet = M.wet[b];
+    real at[3], speed[3], moment[3], push[3] = {}, torque[3] = {};
+    place_of(s, link, wet.at, at);
+    cross(speed, v, at);
+    for (int k = 0; k < 3; k++) speed[k] += v[3 + k] - M.wind[k];
+    for (int k = 0; k < 3; k++) {
+      real axis[3];
+      s.pose[link].turn(axis, wet.axes + 3 * k);
+      const real turns = dot(v, axis), moves = dot(speed, axis);
+      const real resists = turns * (wet.viscous_torque + wet.drag_torque[k] * fabs(turns));
+      const real holds = moves * (wet.viscous_force + wet.drag_force[k] * fabs(moves));
+      for (int j = 0; j < 3; j++) torque[j] += resists * axis[j], push[j] += holds * axis[j];
+    }
+    cross(moment, at, push);
+    for (int k = 0; k < 3; k++) {
+      force[k] += moment[k] + torque[k];
+      force[3 + k] += push[k];
+    }
+  }
+}
+
 // Leaves minus the forces in s.imbalance.
 DEV void passive(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
