@@ -58,3 +58,20 @@ def test_peers_say_their_precision_and_settings():
     candidate.run()
     assert (candidate.env_steps, candidate.row["precision"]) == (2, "float64")
     assert f"{threads()} threads; NEWTON, 100 iterations" in candidate.row["settings"]
+
+
+def test_a_trained_policy_stands_beside_warp_and_few_episodes_have_milliseconds():
+    robot = "m:Robot xml_file=models/go1/xmls/scene.xml"
+    row = GPU | {"task": robot, "batch": 2048, "what": rows.UNTRAINED}
+    few = row | {"batch": 32, "env_steps_per_second": [1.6e5]}
+    trained = row | {"what": rows.TRAINED, "env_steps_per_second": [9e6]}
+    warp = row | {"engine": "MuJoCo Warp", "what": "rollout, no policy"}
+    slow, fast = (
+        warp | {"env_steps_per_second": [x], "batch": n} for x, n in ((4e4, 32), (5e5, 9))
+    )
+    raw = tables.last_calls([row, few, trained, slow, fast])
+    assert tables.gpu(raw).splitlines()[-1].count("2.00e6") == 1
+    assert tables.trained(raw).splitlines()[-1] == (
+        "| go1 scene | 2.00e6 | 9.00e6 | 5.00e5 | 9 x 20 | 4.0 | 18 |"
+    )
+    assert tables.latency(raw).splitlines()[2:] == ["| go1 scene | 32 | 0.2 | 0.8 | 4.0 |"]

@@ -5,8 +5,8 @@ import itertools
 import pytest
 
 from experiments.checks.robots import __main__ as robots
-from experiments.checks.robots import page, playing
-from experiments.kit import rows
+from experiments.checks.robots import page, playing, teams
+from experiments.kit import device_code, rows
 
 #: A slide that a motor pushes against a wall; {} are options.
 MODEL = """
@@ -59,6 +59,28 @@ def test_each_model_has_a_row_and_is_judged_once(tmp_path):
     for row in (slow, fast):
         assert float(row["error"]) <= playing.EQUAL
         assert float(row["ratio"]) > 0
+
+
+@pytest.mark.skipif(device_code.COMPILER is None, reason="there is no C++ compiler")
+def test_teams_are_compared_with_c_mujoco_and_counted(tmp_path, capsys):
+    folder = tmp_path / "mujoco_menagerie" / "slider"
+    folder.mkdir(parents=True)
+    (folder / "scene.xml").write_text(MODEL.format(option="", actuator=MOTOR))
+    (folder / "slider_mjx.xml").write_text(MODEL.format(option='solver="CG"', actuator=MOTOR))
+    (folder / "part.xml").write_text('<mujoco><include file="nowhere.xml"/></mujoco>')
+    path = tmp_path / "rows.csv"
+    for _ in range(2):
+        robots.main(robots.Settings("teams", path, tmp_path))
+    part, scene, for_mjx = rows.read(path)
+    assert part["verdict"] == "no model"
+    assert for_mjx["verdict"] == "refused"
+    assert "Newton" in for_mjx["cause"]
+    assert scene["verdict"] == "accepted"
+    assert float(scene["error20"]) < teams.MAX_ERROR
+    assert float(scene["ratio200"]) < teams.MAX_RATIO
+    table = capsys.readouterr().out.splitlines()
+    assert "| Menagerie's files for MJX | 1 | 0 | 0 | 0 | 0 | 0 |" in table
+    assert table[-1] == "| all | 2 | 1 | 1 | 1 | 1 | 1 |"
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,13 @@
     python -m experiments.checks.robots equality ROWS.csv FOLDER          # by the engine of auto
     python -m experiments.checks.robots speed ROWS.csv FOLDER
     python -m experiments.checks.robots page ROWS.csv
+    python -m experiments.checks.robots teams TEAMS.csv FOLDER
 
 FOLDER has a folder for each package, such as pip has unpacked. Each model is judged by a process of
 its own, with limits of time and memory. ROWS.csv gets a row each, and a model that has its row is
 skipped, so a run can be cut off and continued. ``page`` writes docs/robots.csv and docs/robots.md.
+``teams`` asks which models the device code of teams covers, compares what it covers with C MuJoCo,
+and prints the counts; its rows, of other columns (see teams.py), have a file of their own.
 """
 
 import dataclasses
@@ -18,7 +21,7 @@ from typing import Any, Literal
 
 import tyro
 
-from experiments.checks.robots import models, page
+from experiments.checks.robots import models, page, teams
 from experiments.checks.robots.judging import Question, judged
 from experiments.kit import rows
 
@@ -33,7 +36,7 @@ _NOT_PLAYED = ("no model", "same mechanism", "no actuators")
 class Settings:
     """Judge models that others wrote."""
 
-    phase: tyro.conf.Positional[Literal["equality", "speed", "page"]]
+    phase: tyro.conf.Positional[Literal["equality", "speed", "page", "teams"]]
     """What to do."""
     output: tyro.conf.Positional[Path]
     """The rows."""
@@ -105,6 +108,8 @@ def main(settings: Settings) -> None:
     """Does what is asked for."""
     if settings.phase == "page":
         page.write(rows.read(settings.output))
+    elif settings.phase == "teams":
+        teams.measure(settings.output, settings.folder, settings.seconds)
     else:
         measure(settings)
 

@@ -10,6 +10,7 @@ import tempfile
 import time
 import traceback
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,14 +45,7 @@ def judge(question: Question, path: Path, mechanisms: dict[str, str], sender: An
       mechanisms: the models that have a row, by the mechanism.
       sender: the end of a pipe.
     """
-    limit = int(question.gigabytes * 2**30)
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    # MuJoCo writes its log into the current folder, and prints its warnings.
-    os.chdir(tempfile.gettempdir())
-    silence = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(silence, 1)
-    os.dup2(silence, 2)
-    warnings.simplefilter("ignore")
+    isolate(question.gigabytes)
     try:
         model, stubs = models.load(path)
     except ValueError as error:
@@ -86,6 +80,18 @@ def judge(question: Question, path: Path, mechanisms: dict[str, str], sender: An
             sender.send({"verdict": "crashed", "cause": f"{type(error).__name__}: {sentence}"})
 
 
+def isolate(gigabytes: float) -> None:
+    """Limits the memory of this process, and lets it write nothing."""
+    limit = int(gigabytes * 2**30)
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    # MuJoCo writes its log into the current folder, and prints its warnings.
+    os.chdir(tempfile.gettempdir())
+    silence = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(silence, 1)
+    os.dup2(silence, 2)
+    warnings.simplefilter("ignore")
+
+
 def words(message: object, path: Path) -> str:
     """Returns the beginning of a message, in one line, without this machine's folders."""
     text = " ".join(str(message).replace(str(path), path.name).split())
@@ -109,20 +115,31 @@ def _kill(process: Any) -> None:
 
 def judged(question: Question, path: Path, mechanisms: dict[str, str]) -> dict[str, Any]:
     """Returns what a process of its own finds out about a model."""
+    return answers(judge, question, path, mechanisms, seconds=question.seconds)
+
+
+def answers(function: Callable[..., None], *arguments: Any, seconds: float) -> dict[str, Any]:
+    """Returns what a function sends from a process of its own; a verdict if that fails.
+
+    Args:
+      function: of the arguments and of the end of a pipe, by which it sends parts of a row.
+      *arguments: its arguments but the last.
+      seconds: it may take so long.
+    """
     # A server has imported everything once, before any thread of JAX's; each model is its child.
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["experiments.checks.robots.judging"])
+    context.set_forkserver_preload([function.__module__])
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=judge, args=(question, path, mechanisms, sender))
+    process = context.Process(target=function, args=(*arguments, sender))
     process.start()
     sender.close()
-    deadline = time.monotonic() + question.seconds
+    deadline = time.monotonic() + seconds
     row: dict[str, Any] = {}
     try:
         while receiver.poll(max(0.0, deadline - time.monotonic())):
             row |= receiver.recv()
         _kill(process)
-        return row | {"verdict": "too long", "cause": f"over {question.seconds:g} s"}
+        return row | {"verdict": "too long", "cause": f"over {seconds:g} s"}
     except EOFError:  # the process has ended
         process.join()
         if process.exitcode:

@@ -10,6 +10,13 @@ cut off keeps what was timed. On a CPU a process has two threads from its start,
 on the same two cores (``taskset``). `tables.py` makes the tables.
 ``cpu --tasks Hopper-v5 --csv rows.csv`` times one task on the machine at hand, in some minutes.
 
+A task is an id of ``envs.make``, with settings after it, such as a robot's file, and ``--runs`` are
+run directories of such tasks, whose best policies play, too:
+
+    ROBOT="experiments.speed.benchmark.robots:Robot xml_file=models/go1/scene.xml"
+    python -m mjx_reinforce.train --env ${ROBOT% *} --env-set ${ROBOT#* } --output go1
+    python -m experiments.speed.benchmark gpu --minutes 8 --tasks "$ROBOT" Humanoid-v5 --runs go1
+
 All engines play the same looping task: an episode that ends starts again from its own start state,
 so that every simulated step is a real one. Compare rows of one call with each other, not with
 another machine's. With MJX_REINFORCE_DEBUG=1 the native engine describes its kernels.
@@ -22,7 +29,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, Literal, NamedTuple
 
@@ -39,7 +46,8 @@ class Sizes(NamedTuple):
     of 200 env steps, left too little of 80 GB.
 
     batch, steps: of native's episodes
-    few: native is timed with so many episodes too, and MuJoCo Warp with so many worlds
+    few: native is timed with so many episodes too, and MuJoCo Warp with so many worlds; of few
+      episodes the rows tell how long an env step takes
     mjx: the episodes of plain MJX, each number that is tried
     mjx_steps: their env steps
     warp: the worlds of MuJoCo Warp, each number that is tried
@@ -53,8 +61,11 @@ class Sizes(NamedTuple):
     few: tuple[int, ...] = ()
 
 
-#: A task of a user's own.
+#: A task of a user's own, and the same with elliptic cones.
 QUADRUPED = "experiments.examples.quadruped:Quadruped"
+ELLIPTIC = "experiments.speed.benchmark.robots:EllipticQuadruped"
+#: Of a task that is not in ``GPU``.
+OTHER = Sizes(33_792, 200, few=(2_048,))
 #: What stands first is timed first, and so kept where a call is cut off.
 GPU = {
     "InvertedPendulum-v5": Sizes(262_144, 200, (16_384, 65_536), 50, (32_768, 131_072)),
@@ -67,9 +78,10 @@ GPU = {
     "Swimmer-v5": Sizes(135_168, 200, (8_192,), 20, (32_768, 131_072)),
     "InvertedDoublePendulum-v5": Sizes(135_168, 200, (4_096,), 20, (32_768, 131_072)),
     "CartPole-v1": Sizes(262_144, 200, warp=()),
-    "Humanoid-v5": Sizes(33_792, 100, few=(2_048,)),
+    "Humanoid-v5": Sizes(33_792, 100, few=(1, 32, 256, 2_048)),
     "HumanoidStandup-v5": Sizes(33_792, 100, few=(2_048,)),
-    QUADRUPED: Sizes(33_792, 200, few=(2_048,)),
+    QUADRUPED: OTHER,
+    ELLIPTIC: OTHER,
 }
 #: Episodes and env steps of native's on two cores.
 CPU = {
@@ -98,7 +110,9 @@ class Settings:
     repeats: int = 4
     """Timed runs of each row, after one that warms up."""
     tasks: tuple[str, ...] = ()
-    """All of the part if not given."""
+    """All of the part if not given: ids, with settings after them, "ID NAME=VALUE"."""
+    runs: tuple[Path, ...] = ()
+    """Run directories whose best policies play on a GPU, too, each in the task of its training."""
     shrink: int = 1
     """Divide episodes and worlds by this, to try the script; such rows are worth nothing."""
     worker: str = ""
@@ -167,6 +181,8 @@ def start(task: str, index: int, date: str, settings: Settings) -> subprocess.Po
     command += ["--tasks", task, "--worker", date]
     for name in ("minutes", "csv", "commit", "repeats", "shrink"):
         command.append(f"--{name}={getattr(settings, name)}")
+    runs = [str(run) for run in settings.runs if task_of(run) == task]
+    command += ["--runs", *runs] if runs else []
     environment = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     if settings.part == "cpu":
         environment["JAX_PLATFORMS"] = "cpu"
@@ -215,8 +231,10 @@ def work(settings: Settings) -> None:
 
     jax.config.update("jax_default_matmul_precision", "highest")
     (task,) = settings.tasks
-    prepare = {"gpu": on_gpu, "cpu": on_cpu}[settings.part]
-    candidates = prepare(task, settings.shrink)
+    if settings.part == "gpu":
+        candidates = on_gpu(task, settings.shrink, settings.runs)
+    else:
+        candidates = on_cpu(task, settings.shrink)
     print("compiled", flush=True)
     if sys.stdin.readline().strip() != "go":
         return
@@ -226,6 +244,14 @@ def work(settings: Settings) -> None:
     for row in rows:
         words = (row[key] for key in ("task", "what", "engine", "precision", "batch"))
         print(*words, f"{speed(row):.3g} env steps/s", sep=", ", flush=True)
+
+
+def task_of(run: Path) -> str:
+    """Returns the task that a run was trained in."""
+    from mjx_reinforce.export.run_files import read_run
+
+    facts = read_run(run)
+    return " ".join((facts.env, *facts.env_set))
 
 
 def added(task: str, worlds: int) -> list[Candidate]:
@@ -241,14 +267,20 @@ def added(task: str, worlds: int) -> list[Candidate]:
     return [candidate]
 
 
-def on_gpu(task: str, shrink: int) -> Callable[[], list[Candidate]]:
+def on_gpu(task: str, shrink: int, runs: Sequence[Path]) -> Callable[[], list[Candidate]]:
     """Native, plain MJX, C MuJoCo and MuJoCo Warp; records wait, for all tasks share the GPU."""
     from experiments.speed.benchmark.ours import rollout_of, rollouts
     from experiments.speed.benchmark.peers import c_mujoco
 
-    sizes = GPU[task]
-    native = rollout_of(task, "native", sizes.steps)
-    native(128).run()  # the machine code is the same for any number of episodes
+    sizes = GPU.get(task, OTHER)
+    native = []
+    for run in (None, *runs):
+        try:
+            native.append(rollout_of(task, "native", sizes.steps, run=run))
+        except ValueError as error:  # what native refuses, peers may play
+            print(f"{task}: {error}", file=sys.stderr, flush=True)
+    for rollout in native:
+        rollout(128).run()  # the machine code is the same for any number of episodes
     plain = [batch // shrink for batch in sizes.mjx]
     others = rollouts(task, "plain MJX", plain, sizes.mjx_steps) if plain else []
     if sizes.warp:
@@ -256,9 +288,10 @@ def on_gpu(task: str, shrink: int) -> Callable[[], list[Candidate]]:
         added(task, 128)  # compiles
 
     def candidates() -> list[Candidate]:
-        ours = [native(batch // shrink) for batch in (*sizes.few, sizes.batch)]
-        worlds = (*sizes.few, *sizes.warp)
-        return sum((added(task, number // shrink) for number in worlds), ours + others)
+        batches = [max(1, batch // shrink) for batch in (*sizes.few, sizes.batch)]
+        worlds = [max(1, number // shrink) for number in (*sizes.few, *sizes.warp)]
+        ours = [rollout(batch) for rollout in native for batch in batches]
+        return sum((added(task, number) for number in worlds), ours + others)
 
     return candidates
 

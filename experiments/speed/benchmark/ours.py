@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -10,8 +11,9 @@ import jax.numpy as jnp
 from flax import struct
 from mujoco import mjx
 
-from experiments.speed.benchmark.rows import Candidate
-from mjx_reinforce import Actor, act, categorical, envs, mlp_policy, normal
+from experiments.speed.benchmark.robots import make
+from experiments.speed.benchmark.rows import TRAINED, UNTRAINED, Candidate
+from mjx_reinforce import Actor, Policy, act, categorical, load, mlp_policy, normal
 from mjx_reinforce.engine.base import Discrete, action_space, observation_size
 from mjx_reinforce.engine.play.choice import ActingPolicy, choose
 from mjx_reinforce.learning import normalize
@@ -60,21 +62,30 @@ def rollouts(
 
 
 def rollout_of(
-    env_id: str, name: str, steps: int, precision: str = "float32"
+    env_id: str, name: str, steps: int, precision: str = "float32", run: Path | None = None
 ) -> Callable[[int], Candidate]:
-    """Makes the machine code of a rollout; returns what compiles a program of so many episodes."""
-    task: Any = envs.make(env_id)
+    """Makes the machine code of a rollout; returns what compiles a program of so many episodes.
+
+    Args:
+      env_id: the task.
+      name: one of ``ENGINES``.
+      steps: of an episode.
+      precision: for the row.
+      run: whose best policy plays; an untrained one if not given.
+
+    Raises:
+      ValueError: the engine cannot play this.
+    """
+    task: Any = make(env_id)
     if name == "plain MJX":
         task._forward = partial(mjx.forward, task.model)
         task._physics_step = partial(mjx.step, task.model)
     env = Loop(task, steps)
-    size = observation_size(env)
-    space = action_space(env)
-    # The noise decides how soon a robot falls; it is that of all rows so far, in the action's unit.
-    noisy = partial(normal, initial_std=0.5)
-    distribution = (categorical if isinstance(space, Discrete) else noisy)(space)
-    network = mlp_policy(size, distribution, (16, 32))
-    actor = Actor(params=network.init(jax.random.key(0)), normalizer=normalize.init(size))
+    if run is None:
+        network, actor = untrained(env)
+    else:
+        player = load(run)
+        network, actor = player.policy, player.actor
     play_act = partial(act, network)
     began = time.perf_counter()
     policy = ActingPolicy(play_act, actor, network.distribution)
@@ -86,11 +97,23 @@ def rollout_of(
             sizes = {"num_episodes": batch, "horizon": steps}
             return engine.rollout(env, play_act, actor, network.distribution, key, **sizes)
 
-        row = {"what": "rollout, untrained 16-32 policy", "engine": name, "task": env_id}
-        row |= {"precision": precision, "batch": batch, "steps": steps}
+        row = {"what": UNTRAINED if run is None else TRAINED, "engine": name, "task": env_id}
+        row |= {"precision": precision, "batch": batch, "steps": steps, "settings": engine.why}
         return compiled(row, play, actor, batch * steps, choosing)
 
     return of
+
+
+def untrained(env: Any) -> tuple[Policy, Actor]:
+    """Returns a new policy with layers of 16 and 32 units, and its parameters."""
+    size = observation_size(env)
+    space = action_space(env)
+    # The noise decides how soon a robot falls; it is that of all rows so far, in the action's unit.
+    noisy = partial(normal, initial_std=0.5)
+    distribution = (categorical if isinstance(space, Discrete) else noisy)(space)
+    network = mlp_policy(size, distribution, (16, 32))
+    params = network.init(jax.random.key(0))
+    return network, Actor(params=params, normalizer=normalize.init(size))
 
 
 def compiled(

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from experiments.kit.rows import threads
+from experiments.speed.benchmark.robots import make
 from experiments.speed.benchmark.rows import Candidate
-from mjx_reinforce import envs
 
 #: Env steps that MuJoCo Warp's worlds have gone through before they are timed.
 WARP_BEFORE = 50
@@ -20,7 +20,7 @@ WARP_ROOM = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZ
 
 def peers(env_id: str) -> list[Candidate]:
     """C MuJoCo on all threads, and Gymnasium's vector environment where it can run."""
-    candidates = [c_mujoco(env_id)] if hasattr(envs.make(env_id), "mj_model") else []
+    candidates = [c_mujoco(env_id)] if hasattr(make(env_id), "mj_model") else []
     if _in_gymnasium(env_id):
         candidates.append(gymnasium_vector(env_id))
     return candidates
@@ -33,13 +33,13 @@ def c_mujoco(env_id: str, batch: int = 512, steps: int = 20) -> Candidate:
     """
     from mujoco import MjData, mj_getState, mj_stateSize, mjtState, rollout  # type: ignore
 
-    env = envs.make(env_id)
+    env = make(env_id)
     model = env.mj_model
     full = mjtState.mjSTATE_FULLPHYSICS
     start = np.empty(mj_stateSize(model, full))
-    mj_getState(model, MjData(model), start, full)
+    mj_getState(model, _start(model), start, full)
     data = [MjData(model) for _ in range(threads())]
-    control = np.repeat(_actions(env, batch, steps), env.frame_skip, axis=1)
+    control = np.repeat(_controls(env, batch, steps), env.frame_skip, axis=1)
     pool = rollout.Rollout(nthread=threads())
 
     def run():
@@ -61,20 +61,20 @@ def mujoco_warp(env_id: str, batch: int, steps: int = 20) -> Candidate:
     Raises (when run):
       RuntimeError: a world came to need more.
     """
+    import mujoco_warp  # pyright: ignore
     import warp  # pyright: ignore
-    from mujoco import MjData, mj_forward  # type: ignore
-    from mujoco.mjx.third_party import mujoco_warp  # pyright: ignore
-    from mujoco.mjx.third_party.mujoco_warp._src.types import OverflowType  # pyright: ignore
+    from mujoco import mj_forward  # type: ignore
+    from mujoco_warp import OverflowType  # pyright: ignore
 
-    warp.config.quiet = True
-    env = envs.make(env_id)
+    warp.config.log_level = warp.LOG_WARNING
+    env = make(env_id)
     model = env.mj_model
-    data = MjData(model)
+    data = _start(model)
     mj_forward(model, data)
     started = time.perf_counter()
     on_gpu = mujoco_warp.put_model(model)
     on_gpu.opt.warn_overflow = 0  # said once, below
-    actions = _actions(env, batch, 1)[:, 0].astype(np.float32)
+    actions = _controls(env, batch, 1)[:, 0].astype(np.float32)
     too_small = sum(OverflowType[name] for name in WARP_ROOM)
 
     def begin(room):
@@ -113,9 +113,11 @@ def mujoco_warp(env_id: str, batch: int, steps: int = 20) -> Candidate:
     row: dict[str, Any] = {"what": "rollout, no policy", "engine": "MuJoCo Warp", "task": env_id}
     row |= {"precision": "float32", "batch": batch, "steps": steps}
     row["device"] = warp.get_device().name
-    sizes = ", ".join(f"{name} {size}" for name, size in room.items())
+    most = {"nconmax": kept[0].nacon.numpy()[0] / batch, "njmax": kept[0].nefc.numpy().max()}
+    sizes = ", ".join(f"{name} {size} ({most[name]:.3g} in use)" for name, size in room.items())
     own = f"graph_conditional {on_gpu.opt.graph_conditional}, tolerance at least 1e-6"
-    row["settings"] = f"{sizes}; {options(model)}; {own}; warp {warp.__version__}"
+    versions = f"mujoco-warp {mujoco_warp.__version__}, warp {warp.__version__}"
+    row["settings"] = f"{sizes}, no world overflowed; {options(model)}; {own}; {versions}"
     row["compile_seconds"] = time.perf_counter() - started
     return Candidate(row, run, batch * steps)
 
@@ -127,15 +129,14 @@ def warp_room(env_id: str, worlds: int = 64, steps: int = 130) -> dict[str, int]
     Half as many again as C MuJoCo has at most, in as many worlds under constant random actions, and
     the next multiple of eight.
     """
-    from mujoco import MjData, mj_resetData, mj_step  # type: ignore
+    from mujoco import mj_step  # type: ignore
 
-    env = envs.make(env_id)
+    env = make(env_id)
     model = env.mj_model
-    data = MjData(model)
     contacts = rows = 0
-    for action in _actions(env, worlds, 1)[:, 0]:
-        mj_resetData(model, data)
-        data.ctrl[:] = action
+    for control in _controls(env, worlds, 1)[:, 0]:
+        data = _start(model)
+        data.ctrl[:] = control
         for _ in range(steps * env.frame_skip):
             mj_step(model, data)
             contacts, rows = max(contacts, data.ncon), max(rows, data.nefc)
@@ -178,10 +179,21 @@ def gymnasium_vector(env_id: str, batch: int = 8, steps: int = 50) -> Candidate:
     return Candidate(row, run, batch * steps)
 
 
-def _actions(env, batch: int, steps: int) -> np.ndarray:
-    """Draws actions [batch, steps, A] evenly between the bounds."""
+def _start(model: Any) -> Any:
+    """Returns a simulation at the model's first key frame, or at its pose."""
+    from mujoco import MjData, mj_resetDataKeyframe  # type: ignore
+
+    data = MjData(model)
+    if model.nkey:
+        mj_resetDataKeyframe(model, data, 0)
+    return data
+
+
+def _controls(env: Any, batch: int, steps: int) -> np.ndarray:
+    """Draws actions evenly between their bounds; returns their controls [batch, steps, U]."""
     low, high = env.action_space
-    return np.random.default_rng(0).uniform(low, high, (batch, steps, env.mj_model.nu))
+    actions = np.random.default_rng(0).uniform(low, high, (batch, steps, env.action_size))
+    return np.asarray(env.control(actions))
 
 
 def _in_gymnasium(env_id: str) -> bool:

@@ -13,6 +13,9 @@ from experiments.kit.places import DOCS
 
 #: Where the tables and the figure of the documents find their numbers.
 RAW = DOCS / "benchmarks.csv"
+#: What a row says of the policy that plays.
+UNTRAINED = "rollout, untrained 16-32 policy"
+TRAINED = "rollout, trained policy"
 COLUMNS: tuple[str, ...] = (
     *("date", "commit", "machine", "device", "jax", "task", "what", "engine", "precision"),
     *("batch", "steps", "settings", "compile_seconds", "env_steps_per_second"),

@@ -8,11 +8,12 @@ greatest where several batches were tried; a ratio is of rows of one call.
 import functools
 import textwrap
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from experiments.kit.markdown import filled, listed, table
 from experiments.kit.places import DOCS, ROOT
-from experiments.speed.benchmark.rows import RAW, read, speed
+from experiments.speed.benchmark.rows import RAW, TRAINED, read, speed
 
 PAGES = (ROOT / "README.md", DOCS / "benchmarks.md")
 #: The tasks that are compared in words.
@@ -21,6 +22,8 @@ OTHERS = (
     *("InvertedDoublePendulum-v5", "Swimmer-v5", "Pusher-v5", "Humanoid-v5"),
     *("HumanoidStandup-v5", "experiments.examples.quadruped:Quadruped", "CartPole-v1"),
 )
+#: Numbers of episodes of which an env step's milliseconds are shown.
+SMALL = (1, 32, 256)
 
 
 class Raw(NamedTuple):
@@ -48,11 +51,28 @@ def _date(row: dict[str, Any]) -> str:
 
 
 def best(
-    rows: list[dict[str, Any]], task: str, engine: str, precision: str = ""
+    rows: list[dict[str, Any]],
+    task: str,
+    engine: str,
+    precision: str = "",
+    *,
+    trained: bool = False,
+    batch: int | None = None,
 ) -> dict[str, Any] | None:
-    """Returns the fastest row of a task and an engine, of one precision if given."""
+    """Returns the fastest row of a task and an engine.
+
+    Args:
+      rows: all rows.
+      task: its name.
+      engine: its name.
+      precision: of the row, if given.
+      trained: whether a trained policy plays.
+      batch: how many episodes or worlds, if given.
+    """
     fit = [row for row in rows if row["task"] == task and row["engine"] == engine]
     fit = [row for row in fit if precision in ("", row["precision"])]
+    fit = [row for row in fit if (row["what"] == TRAINED) == trained]
+    fit = [row for row in fit if batch in (None, row["batch"])]
     return max(fit, key=speed, default=None)
 
 
@@ -81,8 +101,19 @@ def at(row: dict[str, Any] | None) -> str:
 
 def tasks_of(rows: list[dict[str, Any]]) -> list[str]:
     """Returns the tasks that rows have, in the order of the tables."""
-    have = {row["task"] for row in rows}
-    return [task for task in FEW + OTHERS if task in have]
+    have = dict.fromkeys(row["task"] for row in rows)
+    known = FEW + OTHERS
+    return [task for task in (*known, *(x for x in have if x not in known)) if task in have]
+
+
+def short(task: str) -> str:
+    """Returns the name of a task for people: its class, or the folder and name of its model."""
+    _, is_file, file = task.partition("xml_file=")
+    if is_file:
+        path = Path(file)
+        robot = [part for part in path.parts[:-1] if part != "xmls"][-1:]
+        return " ".join((*robot, path.stem))
+    return task.rpartition(":")[2]
 
 
 def origin(rows: list[dict[str, Any]]) -> str:
@@ -147,10 +178,42 @@ def gpu(raw: Raw) -> str:
             best(raw.gpu, task, engine) for engine in ("native", "MuJoCo Warp", "plain MJX")
         )
         card = "" if native is None else native["device"].split()[1]
-        cells = (task.rpartition(":")[2], card, rate(native), at(native), rate(warp), rate(plain))
+        cells = (short(task), card, rate(native), at(native), rate(warp), rate(plain))
         rows.append((*cells, ratio(native, warp)))
     header = ("task", "on", "native", "episodes x steps", "MuJoCo Warp", "plain MJX")
     return f"{origin(raw.gpu)}\n\n{table((*header, 'native / Warp'), rows)}"
+
+
+def trained(raw: Raw) -> str:
+    """Tasks on a GPU that a trained policy plays, too."""
+    rows = []
+    for task in tasks_of(raw.gpu):
+        policy = best(raw.gpu, task, "native", trained=True)
+        if policy is not None:
+            native, warp = (best(raw.gpu, task, engine) for engine in ("native", "MuJoCo Warp"))
+            cells = (short(task), rate(native), rate(policy), rate(warp), at(warp))
+            rows.append((*cells, ratio(native, warp), ratio(policy, warp)))
+    header = ("task", "untrained", "trained", "MuJoCo Warp", "worlds x steps")
+    return table((*header, "untrained / Warp", "trained / Warp"), rows)
+
+
+def latency(raw: Raw) -> str:
+    """How long an env step of few episodes takes on a GPU (ms)."""
+
+    def milliseconds(row: dict[str, Any] | None) -> str:
+        """Returns how long an env step of all its episodes takes."""
+        return "" if row is None else f"{1e3 * row['batch'] / speed(row):.3g}"
+
+    rows = []
+    for task in tasks_of(raw.gpu):
+        for batch in SMALL:
+            native, warp = (
+                best(raw.gpu, task, engine, batch=batch) for engine in ("native", "MuJoCo Warp")
+            )
+            if native is not None:
+                cells = (milliseconds(native), milliseconds(warp), ratio(native, warp))
+                rows.append((short(task), str(batch), *cells))
+    return table(("task", "episodes", "native, ms", "MuJoCo Warp, ms", "Warp / native"), rows)
 
 
 def cpu(raw: Raw) -> str:
@@ -161,7 +224,7 @@ def cpu(raw: Raw) -> str:
         c_mujoco, gymnasium = (best(raw.cpu, task, x) for x in ("C MuJoCo", "Gymnasium"))
         cells = (at(single), rate(single), rate(double), rate(c_mujoco))
         ratios = (ratio(double, c_mujoco), ratio(single, c_mujoco))
-        rows.append((task.rpartition(":")[2], *cells, *ratios, rate(gymnasium)))
+        rows.append((short(task), *cells, *ratios, rate(gymnasium)))
     header = (
         *("task", "episodes x steps", "native, float32", "native, float64", "C MuJoCo, float64"),
         *("float64 / C", "float32 / C", "Gymnasium"),
@@ -173,6 +236,8 @@ TABLES: dict[str, Callable[[Raw], str]] = {
     "speed": readme,
     "speed in words": words,
     "speed on a GPU": gpu,
+    "speed with trained policies": trained,
+    "milliseconds": latency,
     "speed on two cores": cpu,
 }
 

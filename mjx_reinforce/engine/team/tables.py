@@ -442,7 +442,7 @@ class _Tables:
                 is_shift_pair = dof_kinds[i] == dof_kinds[j] == _SHIFTS_IN_THE_WORLD
                 if j < i and not is_shift_pair:
                     dof_pairs.append(records.packed(j, i))
-                j = model.dof_parentid[j]
+                j = int(model.dof_parentid[j])  # NumPy's would overflow in a mask
             # The last degree of freedom of a link has the longest chain, and overwrites the others.
             link_chains[self.dof_joint[i]] = chain
         self.ints["paired"] = dof_pairs

@@ -4,10 +4,6 @@
 step from so many states of a task's random play.
 """
 
-import ctypes
-import re
-import shutil
-import subprocess
 import sys
 import tempfile
 import tomllib
@@ -20,16 +16,14 @@ import numpy as np
 import pytest
 
 from experiments.checks import contacts
+from experiments.kit import device_code
+from experiments.kit.device_code import compiled as _compiled
 from mjx_reinforce.engine.scalar import UnsupportedPrimitive
 from mjx_reinforce.engine.team import tables
 from mjx_reinforce.envs import models
 
 _C: Any = mujoco
-_COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
-needs_compiler = pytest.mark.skipif(_COMPILER is None, reason="there is no C++ compiler")
-
-#: What a step is compared on, and how many numbers each has of a body.
-_OF_BODIES = {"xpos": 3, "xipos": 3, "cinert": 10, "cvel": 6, "cfrc_ext": 6}
+needs_compiler = pytest.mark.skipif(device_code.COMPILER is None, reason="there is no C++ compiler")
 
 _OWN = str(Path(__file__).parents[3] / "experiments" / "examples" / "quadruped")
 _MODELS = tomllib.loads((Path(__file__).parent / "models.toml").read_text("utf-8"))
@@ -84,34 +78,14 @@ def _exact(m: Any) -> Any:
     return m
 
 
-def _compiled(m: Any, folder: Any, near: int, lanes: int) -> Any:
-    """Returns ``play_steps`` of a model; more lanes than one take turns, see turns.h."""
-    text, run = tables.physics_text(m, near).split("// The operations of")[0], "play()"
-    if lanes > 1:
-        turns, run = (Path(__file__).parent / "turns.h").read_text(), "turns.run(play)"
-        text, found = re.subn(
-            r"struct Team {\n  int lane = 0;.*?\n};\n", lambda _: turns, text, flags=re.S
-        )
-        assert found == 1
-    program = (Path(__file__).parent / "play_steps.h").read_text()
-    source, made = folder / "play.cpp", str(folder / "play.so")
-    source.write_text(f"#define W {lanes}\n#define RUN {run}\n{text}{program}")
-    options = ["-O0", "-std=c++17", "-w", "-shared", "-fPIC"]
-    subprocess.run([str(_COMPILER), *options, str(source), "-o", made], check=True)
-    return ctypes.CDLL(made).play_steps
-
-
 def _error(m: Any, play: Any, data: Any, skip: int) -> float:
     """Plays an env step here and in C; returns the largest error, relative where above 1."""
-    ctrl = np.resize(data.ctrl, max(m.nu, 1)).astype(float)
-    mine = {name: getattr(data, name).copy() for name in ("qpos", "qvel", "qacc_warmstart")}
-    made = np.zeros(sum(_OF_BODIES.values()) * m.nbody + m.nv)
-    given = [*mine.values(), ctrl, skip, made]
-    play(*(x.ctypes.data_as(ctypes.c_void_p) if hasattr(x, "ctypes") else x for x in given))
+    mine = {name: getattr(data, name).copy() for name in device_code.STATE}
+    made = play(mine, data.ctrl, skip)
     for _ in range(skip):
         _C.mj_step(m, data)
     _C.mj_rnePostConstraint(m, data)
-    for name, size in _OF_BODIES.items():
+    for name, size in device_code.OF_BODIES.items():
         mine[name], made = made[: size * m.nbody], made[size * m.nbody :]
     mine["qfrc_actuator"] = made
     errors = []

@@ -1,0 +1,73 @@
+"""The device code of a model's physics, in float64 on a CPU, to be played beside C MuJoCo."""
+
+import ctypes
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce.engine.team import tables
+
+#: A C++ compiler; None where there is none.
+COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+#: What a simulation carries from step to step.
+STATE = ("qpos", "qvel", "qacc_warmstart")
+#: What the steps report of each body, and how many numbers.
+OF_BODIES = {"xpos": 3, "xipos": 3, "cinert": 10, "cvel": 6, "cfrc_ext": 6}
+
+#: (state by the names of ``STATE``, which changes in place; controls [nu]; number of steps) ->
+#: what the last step reports: ``OF_BODIES``, then ``qfrc_actuator`` [nv].
+Steps = Callable[[dict[str, np.ndarray], np.ndarray, int], np.ndarray]
+
+
+def compiled(model: Any, folder: Path, num_near: int = tables.NUM_NEAR, lanes: int = 1) -> Steps:
+    """Returns what plays a model's physics steps.
+
+    Args:
+      model: an ``MjModel`` that teams play.
+      folder: for the text and the library, of its own for each call.
+      num_near: contacts that the state of a team has room for.
+      lanes: of the team; several take turns, see ``turns.h``.
+
+    Raises:
+      UnsupportedPrimitive: the device code lacks something that the model has.
+    """
+    kit = Path(__file__).parent
+    text = tables.physics_text(model, num_near).split("// The operations of")[0]
+    run = "play()"
+    if lanes > 1:
+        turns = (kit / "turns.h").read_text("utf-8")
+        run = "turns.run(play)"
+        team = r"struct Team {\n  int lane = 0;.*?\n};\n"
+        text, num_teams = re.subn(team, lambda _: turns, text, flags=re.DOTALL)
+        assert num_teams == 1
+    program = (kit / "play_steps.h").read_text("utf-8")
+    source = folder / "play.cpp"
+    library = folder / "play.so"
+    source.write_text(f"#define W {lanes}\n#define RUN {run}\n{text}{program}", "utf-8")
+    options = ["-O0", "-std=c++17", "-w", "-shared", "-fPIC"]
+    subprocess.run([str(COMPILER), *options, str(source), "-o", str(library)], check=True)
+    play_steps = ctypes.CDLL(str(library)).play_steps
+    report_size = sum(OF_BODIES.values()) * model.nbody + model.nv
+
+    def play(state: dict[str, np.ndarray], control: np.ndarray, num_steps: int) -> np.ndarray:
+        """Makes so many physics steps; see ``Steps``."""
+        ctrl = np.resize(control, max(model.nu, 1)).astype(float)
+        report = np.zeros(report_size)
+        numbers = [state[name] for name in STATE]
+        start = [_pointer(x) for x in (*numbers, ctrl)]
+        play_steps(*start, num_steps, _pointer(report))
+        return report
+
+    return play
+
+
+def _pointer(numbers: np.ndarray) -> ctypes.c_void_p:
+    """Returns where an array of float64 is."""
+    assert numbers.dtype == float
+    assert numbers.flags.c_contiguous
+    return ctypes.c_void_p(numbers.ctypes.data)
