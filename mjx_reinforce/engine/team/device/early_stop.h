@@ -130,19 +130,6 @@ DEV Mark line_as_c(const Team& t, const Model& M, State& s, const Search& search
   return end.cost < 0 ? end : Mark{0, 0, 0, 0};
 }
 
-// M times s.direction: below the diagonal of s.rows is M.
-DEV void inertia_times_direction(const Team& t, const State& s, const Search& search,
-                                 real (&out)[ROWS_A_LANE]) {
-  UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
-    const int i = t.lane + r * W;
-    out[r] = search.diagonal[r] * search.direction[r];
-    for (int j = 0; j < NV && i < NV; j++) {
-      const int row = j < i ? i : j, column = j < i ? j : i;
-      if (j != i) out[r] += s.rows[row][column / 4].x[column % 4] * s.direction[j / 4].x[j % 4];
-    }
-  }
-}
-
 // Subtracts the forces of contacts and general rows from the gradient.
 DEV void subtract_forces(const Team& t, const Model& M, State& s, real (&gradient)[ROWS_A_LANE]) {
   all_contacts(t, s, [&](const Contact& c) {

@@ -185,6 +185,26 @@ DEV Line line_search(const Team& t, const Model& M, State& s, const Search& sear
   return {length, rest};
 }
 
+// M times s.direction: below the diagonal of s.rows is M.
+DEV void inertia_times_direction(const Team& t, const State& s, const Search& search,
+                                 real (&out)[ROWS_A_LANE]) {
+  const real* flat = &s.rows[0][0].x[0];
+  UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+    const int i = t.lane + r * W, row = i < NV ? i : 0;
+    out[r] = search.diagonal[r] * search.direction[r];
+    UNROLL for (int q = 0; q < (NV + 3) / 4; q++) {
+      const Quad before = s.rows[row][q], step = s.direction[q];
+      for (int k = 0; k < 4; k++) {
+        const int j = 4 * q + k;
+        if (j >= NV) continue;
+        const real entry = j < row ? before.x[k] : flat[j * STRIDE + row];
+        if (j != row) out[r] += entry * step.x[k];
+      }
+    }
+    if (i >= NV) out[r] = 0;
+  }
+}
+
 // Adds M direction to search.imbalance: H direction is minus the gradient, so M direction =
 // -gradient - J' stiffness J direction, without a product with M.
 DEV void follow(const Team& t, const Model& M, State& s, Search& search, real length) {
@@ -258,7 +278,13 @@ DEV int newton(const Team& t, const Model& M, State& s) {
       // would gain its square. A tenth of that is for what the slope does not show.
       if (ELLIPTIC && SINGLE && length == 1)
         settled |= -along * line.rest * line.rest <= M.smallest_gain / 10;
-      follow(t, M, s, search, length);
+      if (ELLIPTIC) {
+        real inertia[ROWS_A_LANE];
+        inertia_times_direction(t, s, search, inertia);
+        UNROLL for (int r = 0; r < ROWS_A_LANE; r++) search.imbalance[r] += length * inertia[r];
+      } else {
+        follow(t, M, s, search, length);
+      }
     }
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++) search.qacc[r] += length * search.direction[r];
     each_contact(t, s, [&](Contact& c) {
