@@ -173,7 +173,8 @@ class _Tables:
                 entries = np.asarray(values).ravel().tolist()
                 struct = records.STRUCTS.get(name, type_name)
                 if not entries:
-                    empty.append(f"{struct} {name}[1];")
+                    is_row = struct in records.FIELDS
+                    empty.append(f"Some<{struct}, 0> {name};" if is_row else f"{struct} {name}[1];")
                     continue
                 row_size = records.size(struct)
                 lines.append(f"  {struct} {name}[{-(-len(entries) // row_size)}];")
