@@ -50,33 +50,20 @@ class Cable(NamedTuple):
     joint: int = -1
 
 
-class Spring(NamedTuple):
-    """The polynomials of a tendon's spring and damper, and the lengths where it is slack (m)."""
-
-    stiffness: tuple[float, ...]
-    damping: tuple[float, ...]
-    rest: tuple[float, ...]
-
-
 class Bound(NamedTuple):
     """A row of a limit or of friction loss.
 
     cable: the number of the cable
-    sides: 1 for its least length, 2 for its most, 3 for the one of both that is near
-    range: these lengths (m, or rad)
-    margin: from where on the limit pushes
-    weight: the inverse mass of the row
-    solref, solimp: MuJoCo's
-    loss: the most that it pushes
+    sides: 1 for its least length, 2 for its most, 3 for the nearer one of both
+    limit: these lengths, from how far on they push (m, or rad), and the inverse mass of the row
+    soft: solref and solimp
+    loss: the most that friction loss pushes
     """
 
     cable: int
-    solref: Any
-    solimp: Any
-    weight: float
-    sides: int = 0
-    range: Any = (0.0, 0.0)
-    margin: float = 0.0
+    sides: int
+    limit: tuple[float, ...]
+    soft: tuple[Any, Any]
     loss: float = 0.0
 
 
@@ -183,63 +170,40 @@ def of_actuators(model: Any, types: Sequence[Any], count: int) -> np.ndarray:
     return sums
 
 
-def spring(model: Any, tendon: int) -> Spring:
-    """Returns how a tendon's spring and damper pull; -1 is no tendon."""
+def spring(model: Any, tendon: int) -> tuple[float, ...]:
+    """Returns the Tendon of ``device/records.h``; -1 is no tendon, and pulls nothing."""
     if tendon < 0:
-        return Spring((0.0,) * 3, (0.0,) * 3, (0.0,) * 2)
+        return (0.0,) * 8
     damping = np.array([model.tendon_damping[tendon], *model.tendon_dampingpoly[tendon]])
-    inherited = of_actuators(model, (_C.mjtTrn.mjTRN_TENDON,), model.ntendon)[tendon, 1:]
-    return Spring(
-        stiffness=(model.tendon_stiffness[tendon], *model.tendon_stiffnesspoly[tendon]),
-        damping=(*(damping + inherited),),
-        rest=(*model.tendon_lengthspring[tendon],),
-    )
+    damping += of_actuators(model, (_C.mjtTrn.mjTRN_TENDON,), model.ntendon)[tendon, 1:]
+    stiffness = (model.tendon_stiffness[tendon], *model.tendon_stiffnesspoly[tendon])
+    return (*stiffness, *damping, *model.tendon_lengthspring[tendon])
 
 
-def limits(model: Any, cables: Sequence[Cable]) -> list[Bound]:
-    """Returns the rows of the limits of cables."""
-    rows = []
+def bounds(model: Any, cables: Sequence[Cable]) -> tuple[list[Bound], list[Bound]]:
+    """Returns the rows of the limits of cables, and those of their friction loss."""
+    limits = []
+    losses = []
     for number, cable in enumerate(cables):
-        if cable.joint >= 0:
-            joint = cable.joint
-            row = Bound(
-                cable=number,
-                sides=2,
-                solref=model.jnt_solref[joint],
-                solimp=model.jnt_solimp[joint],
-                range=(0.0, model.jnt_range[joint].max()),
-                margin=model.jnt_margin[joint],
-                weight=model.dof_invweight0[model.jnt_dofadr[joint]],
-            )
-            rows.append(row)
-        elif cable.tendon >= 0 and model.tendon_limited[cable.tendon]:
-            tendon = cable.tendon
-            span = model.tendon_range[tendon]
-            margin = model.tendon_margin[tendon]
-            row = Bound(
-                cable=number,
-                solref=model.tendon_solref_lim[tendon],
-                solimp=model.tendon_solimp_lim[tendon],
-                range=span,
-                margin=margin,
-                weight=model.tendon_invweight0[tendon],
-            )
+        joint = cable.joint
+        if joint >= 0:
+            weight = model.dof_invweight0[model.jnt_dofadr[joint]]
+            limit = (0.0, model.jnt_range[joint].max(), model.jnt_margin[joint], weight)
+            soft = (model.jnt_solref[joint], model.jnt_solimp[joint])
+            limits.append(Bound(number, sides=2, limit=limit, soft=soft))
+        tendon = cable.tendon
+        if tendon < 0:
+            continue
+        low, high = model.tendon_range[tendon]
+        margin = model.tendon_margin[tendon]
+        limit = (low, high, margin, model.tendon_invweight0[tendon])
+        if model.tendon_limited[tendon]:
+            soft = (model.tendon_solref_lim[tendon], model.tendon_solimp_lim[tendon])
             # Both limits push at once only where their margins overlap.
-            sides = (1, 2) if np.diff(span) < 2 * margin else (3,)
-            rows += [row._replace(sides=x) for x in sides]
-    return rows
-
-
-def losses(model: Any, cables: Sequence[Cable]) -> list[Bound]:
-    """Returns the rows of the friction loss of cables."""
-    return [
-        Bound(
-            cable=number,
-            solref=model.tendon_solref_fri[cable.tendon],
-            solimp=model.tendon_solimp_fri[cable.tendon],
-            weight=model.tendon_invweight0[cable.tendon],
-            loss=model.tendon_frictionloss[cable.tendon],
-        )
-        for number, cable in enumerate(cables)
-        if cable.tendon >= 0 and model.tendon_frictionloss[cable.tendon] > 0
-    ]
+            sides = (1, 2) if high - low < 2 * margin else (3,)
+            limits += [Bound(number, sides=x, limit=limit, soft=soft) for x in sides]
+        loss = model.tendon_frictionloss[tendon]
+        if loss > 0:
+            soft = (model.tendon_solref_fri[tendon], model.tendon_solimp_fri[tendon])
+            losses.append(Bound(number, sides=0, limit=limit, soft=soft, loss=loss))
+    return limits, losses

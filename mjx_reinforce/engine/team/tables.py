@@ -203,7 +203,8 @@ class _Tables:
                 entries = np.asarray(values).ravel().tolist()
                 struct = records.STRUCTS.get(name, type_name)
                 if not entries:
-                    empty.append(f"{struct} {name}[1];")
+                    is_row = struct in records.FIELDS
+                    empty.append(f"Some<{struct}, 0> {name};" if is_row else f"{struct} {name}[1];")
                     continue
                 row_size = records.size(struct)
                 lines.append(f"  {struct} {name}[{-(-len(entries) // row_size)}];")
@@ -519,19 +520,19 @@ class _Tables:
         self.ints["part_frame"] = [self._link_number(x.frame) for x in parts]
         self.reals["part"] = [(*x.at, *x.gear) for x in parts]
         tendons = [cables.spring(model, x.tendon) for x in self.cables]
-        self.constants["TENSE"] = int(any(any(x.stiffness + x.damping) for x in tendons))
-        self.reals["tendon"] = [sum(x, ()) for x in tendons] if self.constants["TENSE"] else []
+        is_tense = any(any(x[:6]) for x in tendons)
+        self.constants["TENSE"] = int(is_tense)
+        self.reals["tendon"] = tendons if is_tense else []
         self.constants["NCABLE"] = len(self.cables)
 
     def _cable_bounds(self) -> None:
         """Makes the tables of limits and, behind them, of friction loss of cables."""
-        limits = cables.limits(self.model, self.cables)
-        losses = cables.losses(self.model, self.cables)
+        limits, losses = cables.bounds(self.model, self.cables)
         rows = [*limits, *losses]
         self.ints["bound_cable"] = [x.cable for x in rows]
-        self.ints["bound_soft"] = [self._soft(x.solref, x.solimp) for x in rows]
+        self.ints["bound_soft"] = [self._soft(*x.soft) for x in rows]
         self.ints["bound_sides"] = [x.sides for x in limits]
-        self.reals["bound"] = [(*x.range, x.margin, x.weight) for x in rows]
+        self.reals["bound"] = [x.limit for x in rows]
         self.reals["bound_loss"] = [x.loss for x in losses]
         self.constants["NLIMITED"] = len(limits)
         self.constants["NLOSS"] = len(losses)
