@@ -16,12 +16,17 @@ from mjx_reinforce.engine.team import tables
 COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
 #: What a simulation carries from step to step.
 STATE = ("qpos", "qvel", "qacc_warmstart")
-#: What the steps report of each body, and how many numbers.
-OF_BODIES = {"xpos": 3, "xipos": 3, "cinert": 10, "cvel": 6, "cfrc_ext": 6}
 
 #: (state by the names of ``STATE``, which changes in place; controls [nu]; number of steps) ->
-#: what the last step reports: ``OF_BODIES``, then ``qfrc_actuator`` [nv].
-Steps = Callable[[dict[str, np.ndarray], np.ndarray, int], np.ndarray]
+#: what the last step reports, by the names of ``report_sizes``.
+Steps = Callable[[dict[str, np.ndarray], np.ndarray, int], dict[str, np.ndarray]]
+
+
+def report_sizes(model: Any) -> dict[str, int]:
+    """Returns how many numbers ``play_steps.h`` writes of each field of mjData, in its order."""
+    of_a_body = {"xpos": 3, "xipos": 3, "cinert": 10, "cvel": 6, "cfrc_ext": 6}
+    sizes = {name: size * model.nbody for name, size in of_a_body.items()}
+    return sizes | {"qfrc_actuator": model.nv}
 
 
 def compiled(model: Any, folder: Path, num_near: int = tables.NUM_NEAR, lanes: int = 1) -> Steps:
@@ -52,16 +57,19 @@ def compiled(model: Any, folder: Path, num_near: int = tables.NUM_NEAR, lanes: i
     options = ["-O0", "-std=c++17", "-w", "-shared", "-fPIC"]
     subprocess.run([str(COMPILER), *options, str(source), "-o", str(library)], check=True)
     play_steps = ctypes.CDLL(str(library)).play_steps
-    report_size = sum(OF_BODIES.values()) * model.nbody + model.nv
+    sizes = report_sizes(model)
+    ends = np.cumsum([*sizes.values()])
 
-    def play(state: dict[str, np.ndarray], control: np.ndarray, num_steps: int) -> np.ndarray:
+    def play(
+        state: dict[str, np.ndarray], control: np.ndarray, num_steps: int
+    ) -> dict[str, np.ndarray]:
         """Makes so many physics steps; see ``Steps``."""
         ctrl = np.resize(control, max(model.nu, 1)).astype(float)
-        report = np.zeros(report_size)
+        report = np.zeros(ends[-1])
         numbers = [state[name] for name in STATE]
         start = [_pointer(x) for x in (*numbers, ctrl)]
         play_steps(*start, num_steps, _pointer(report))
-        return report
+        return dict(zip(sizes, np.split(report, ends[:-1]), strict=True))
 
     return play
 

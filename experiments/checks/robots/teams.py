@@ -174,7 +174,10 @@ def measure(output: Path, folder: Path, seconds: float) -> None:
 
 
 def summary(raw_rows: Sequence[Mapping[str, str]]) -> str:
-    """Returns a table of counts for each set of models: files, and those that teams cover."""
+    """Returns a table of counts for each set of models: files, and those that teams cover.
+
+    Files without actuators are no robots for a policy, and do not count.
+    """
 
     def at_most(limit: float, texts: Iterable[str]) -> str:
         """Returns how many numbers there are that are no larger."""
@@ -182,10 +185,10 @@ def summary(raw_rows: Sequence[Mapping[str, str]]) -> str:
 
     table_rows = []
     for name, select in SETS.items():
-        loaded = [row for row in select(raw_rows) if row["verdict"] != "no model"]
-        # What crashes or takes too long after it was accepted has its sizes, too.
-        covered = [row for row in loaded if row["nv"] and row["verdict"] != "refused"]
-        cells = [name, str(len(loaded)), str(len(covered))]
+        files = [row for row in select(raw_rows) if row["nu"] not in ("", "0")]
+        # What crashes or takes too long after it was accepted counts as covered.
+        covered = [row for row in files if row["verdict"] != "refused"]
+        cells = [name, str(len(files)), str(len(covered))]
         for suffix in ("", "_exact"):
             cells.append(at_most(MAX_ERROR, (row[f"error20{suffix}"] for row in covered)))
             cells.append(at_most(MAX_RATIO, (row[f"ratio200{suffix}"] for row in covered)))
