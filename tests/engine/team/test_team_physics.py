@@ -104,18 +104,25 @@ def _error(m: Any, play: Any, data: Any, skip: int) -> float:
     """Plays an env step here and in C; returns the largest error, relative where above 1."""
     ctrl = np.resize(data.ctrl, max(m.nu, 1)).astype(float)
     mine = {name: getattr(data, name).copy() for name in ("qpos", "qvel", "qacc_warmstart")}
-    made = np.zeros(sum(_OF_BODIES.values()) * m.nbody + m.nv)
+    is_touch = m.sensor_type == _C.mjtSensor.mjSENS_TOUCH
+    sizes = {name: size * m.nbody for name, size in _OF_BODIES.items()} | {"qfrc_actuator": m.nv}
+    sizes |= {"seen_qpos": m.nq, "seen_qvel": m.nv, "seen_qacc": m.nv, "touch": is_touch.sum()}
+    made = np.zeros(sum(sizes.values()))
     given = [*mine.values(), ctrl, skip, made]
     play(*(x.ctypes.data_as(ctypes.c_void_p) if hasattr(x, "ctypes") else x for x in given))
+    theirs = {}
     for _ in range(skip):
+        theirs |= {f"seen_{name}": getattr(data, name).copy() for name in ("qpos", "qvel")}
         _C.mj_step(m, data)
     _C.mj_rnePostConstraint(m, data)
-    for name, size in _OF_BODIES.items():
-        mine[name], made = made[: size * m.nbody], made[size * m.nbody :]
-    mine["qfrc_actuator"] = made
+    theirs |= {"seen_qacc": data.qacc, "touch": data.sensordata[m.sensor_adr[is_touch]]}
+    for name, size in sizes.items():
+        mine[name], made = made[:size], made[size:]
+    if m.opt.integrator == _C.mjtIntegrator.mjINT_RK4:  # C keeps nothing of its last stage
+        mine = {name: x for name, x in mine.items() if name not in theirs}
     errors = []
     for name, x in mine.items():
-        want = np.asarray(getattr(data, name)).ravel()
+        want = np.asarray(theirs[name] if name in theirs else getattr(data, name)).ravel()
         errors.append(np.abs(x - want).max(initial=0) / max(1, np.abs(want).max(initial=0)))
     return max(errors)
 
