@@ -118,8 +118,12 @@ def _error(m: Any, play: Any, data: Any, skip: int) -> float:
     theirs |= {"seen_qacc": data.qacc, "touch": data.sensordata[m.sensor_adr[is_touch]]}
     for name, size in sizes.items():
         mine[name], made = made[:size], made[size:]
-    if m.opt.integrator == _C.mjtIntegrator.mjINT_RK4:  # C keeps nothing of its last stage
+    if m.opt.integrator == _C.mjtIntegrator.mjINT_RK4:  # of its last stage C keeps the poses
+        last = _C.MjData(m)
+        last.qpos[:] = mine["seen_qpos"]
+        _C.mj_kinematics(m, last)
         mine = {name: x for name, x in mine.items() if name not in theirs}
+        mine |= {"xquat": last.xquat.ravel(), "site_xpos": last.site_xpos.ravel()}
     errors = []
     for name, x in mine.items():
         want = np.asarray(theirs[name] if name in theirs else getattr(data, name)).ravel()
