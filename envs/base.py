@@ -24,7 +24,7 @@ from mjx_reinforce.engine.physics import mjx_internals, sensors
 from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
 from mjx_reinforce.engine.scalar import prune, whole
-from mjx_reinforce.engine.team import supported
+from mjx_reinforce.engine.team import last_pass, supported
 from mjx_reinforce.envs import derived, in_batch, models, refusals
 from mjx_reinforce.envs.outcomes import (
     check_centers,
@@ -393,7 +393,11 @@ class MujocoEnv(Env):
         """Returns whether the physics is to stay one operation, which device code computes."""
         return is_kept_whole() and not models.replaced(episode)
 
-    def _whole(self, name: str, start: mjx.Data) -> tuple[mjx.Data, jax.Array]:
+    @functools.cached_property
+    def _shown(self) -> Callable[..., Any]:
+        return jax.jit(functools.partial(last_pass.shown, self.mj_model, self.model))
+
+    def _whole(self, name: str, start: mjx.Data) -> tuple[Any, jax.Array]:
         """Returns what an operation of the device code makes of a simulation; whether it is sound.
 
         Args:
@@ -405,10 +409,17 @@ class MujocoEnv(Env):
         sound = jax.ShapeDtypeStruct((), bool)
         operands = [getattr(start, field) for field in ("ctrl", *models.CARRIED)]
         digest = self.physics_model().digest
-        outputs = whole(name, results | {"sound": sound}, *operands, model=digest)
-        # In the order of ``results``, which is that of the tree's leaves; "sound" is the last.
-        *leaves, is_sound = outputs.values()
-        return tree.unflatten(leaves), is_sound
+        touch = jnp.zeros(len(last_pass.touch_sensors(self.mj_model)), start.qpos.dtype)
+        last = {"seen_qpos": start.qpos, "seen_qvel": start.qvel, "seen_qacc": start.qacc}
+        last |= {"touch": touch, "sound": sound}
+        outputs = whole(name, results | last, *operands, model=digest)
+        # In the order of ``results``, which is that of the tree's leaves.
+        *leaves, qpos, qvel, qacc, touch, is_sound = outputs.values()
+        data = tree.unflatten(leaves)
+        last_data = start.replace(qpos=qpos, qvel=qvel, qacc=qacc)
+        last_data = mjx_internals.with_fields(last_data, cfrc_ext=Simulation(data).cfrc_ext)
+        complete = functools.partial(self._shown, last_data, touch)
+        return last_pass.Completed(self.mj_model, data, complete), is_sound
 
     def _outcome(self, state: Physics, start: mjx.Data, data: View, action: jax.Array) -> Any:
         """Returns what ``outcome`` returns, or raises ValueError where it is no outcome."""

@@ -1,6 +1,7 @@
 """The device code of a model's physics, in float64 on a CPU, to be played beside C MuJoCo."""
 
 import ctypes
+import importlib
 import re
 import shutil
 import subprocess
@@ -11,6 +12,8 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.engine.team import tables
+
+mujoco: Any = importlib.import_module("mujoco")  # pyright does not know what is in it
 
 #: A C++ compiler; None where there is none.
 COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
@@ -26,7 +29,9 @@ def report_sizes(model: Any) -> dict[str, int]:
     """Returns how many numbers ``play_steps.h`` writes of each field of mjData, in its order."""
     of_a_body = {"xpos": 3, "xipos": 3, "cinert": 10, "cvel": 6, "cfrc_ext": 6}
     sizes = {name: size * model.nbody for name, size in of_a_body.items()}
-    return sizes | {"qfrc_actuator": model.nv}
+    num_touches = int(np.sum(model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH))
+    sizes |= {"qfrc_actuator": model.nv, "seen_qpos": model.nq, "seen_qvel": model.nv}
+    return sizes | {"seen_qacc": model.nv, "touch": num_touches}
 
 
 def compiled(model: Any, folder: Path, num_near: int = tables.NUM_NEAR, lanes: int = 1) -> Steps:

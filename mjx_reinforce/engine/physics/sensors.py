@@ -20,7 +20,7 @@ _NO_CONTACT = mjx.DisableBit.CONTACT | mjx.DisableBit.CONSTRAINT
 _CONTACT_TYPES = mjx.SensorType.TOUCH, mjx.SensorType.CONTACT
 _FRAME_TYPES = mjx.SensorType.FRAMELINACC, mjx.SensorType.FRAMEANGACC
 #: What shows forces on bodies, or what follows from them.
-_BODY_TYPES = (
+BODY_TYPES = (
     mjx.SensorType.ACCELEROMETER,
     mjx.SensorType.FORCE,
     mjx.SensorType.TORQUE,
@@ -43,7 +43,7 @@ def sensor_acc(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Computes the sensors of forces and accelerations, as ``mj_sensorAcc``."""
     model, reduced_data = _existing(model, data)
     # These read ``cacc`` and ``cfrc_int``, for which MJX calls its ``rne_postconstraint``.
-    if np.isin(model.sensor_type, _BODY_TYPES).any():
+    if np.isin(model.sensor_type, BODY_TYPES).any():
         reduced_data = _with_tendons(model, reduced_data)
     # MJX fails on sensors of contacts where there can be none; left out, they show zero.
     if not jax_fields(reduced_data).contact.dim.size:

@@ -13,9 +13,10 @@ import mujoco
 import numpy as np
 
 from mjx_reinforce.engine.base import MjModel
+from mjx_reinforce.engine.physics import sensors
 from mjx_reinforce.engine.physics.early_stop import stops_early
 from mjx_reinforce.engine.scalar import UnsupportedPrimitive
-from mjx_reinforce.engine.team import cables, flags, records, supported
+from mjx_reinforce.engine.team import cables, flags, last_pass, records, supported
 from mjx_reinforce.engine.team.frames import Frame, Inertial, rotation, six, times
 from mjx_reinforce.engine.team.records import Softness
 from mjx_reinforce.engine.team.supported import (
@@ -56,6 +57,7 @@ _HEADERS = [
     "elimination",
     "newton",
     "early_stop",
+    "touch",
     "report",
     "lone",
     "integrators",
@@ -154,6 +156,7 @@ class _Tables:
         self._equalities()
         self._cable_bounds()
         self._pairs(num_near)
+        self._sensors()
         self._jumps()
         self._search()
         self.constants["NQ"] = model.nq
@@ -728,6 +731,32 @@ class _Tables:
         self.reals["geom_size"] = []
         if np.isin(types, (BOX, CYLINDER, ELLIPSOID)).any():
             self.reals |= {"geom_turn": turns, "geom_size": size}
+
+    def _sensors(self) -> None:
+        """Makes the tables of sensors of touch."""
+        model = self.model
+        is_of_forces = np.isin(model.sensor_type, sensors.BODY_TYPES)
+        self.constants["SENSES_FORCES"] = int(is_of_forces.any())
+        sites = model.sensor_objid[last_pass.touch_sensors(model)]
+        self.constants["NTOUCH"] = len(sites)
+        if not len(sites):
+            return
+        bodies = model.site_bodyid[sites]
+        frames = [
+            self.frames[body].then(model.site_pos[site], model.site_quat[site])
+            for site, body in zip(sites, bodies, strict=True)
+        ]
+        size = model.site_size[sites]
+        is_sphere = model.site_type[sites] == SPHERE
+        is_cylinder = model.site_type[sites] == CYLINDER
+        size[is_sphere] = size[is_sphere, :1]
+        size[is_cylinder] = size[is_cylinder][:, [0, 0, 1]]
+        self.ints["touch_body"] = bodies
+        self.ints["touch_link"] = [self._link_number(frame.link) for frame in frames]
+        self.ints["touch_round"] = [last_pass.ROUND_AXES[x] for x in model.site_type[sites]]
+        self.reals["touch_at"] = [frame.pos for frame in frames]
+        self.reals["touch_turn"] = [rotation(frame.quat) for frame in frames]
+        self.reals["touch_size"] = size
 
     def _contact_kind(self, pair: supported.GeomPair) -> _ContactKind:
         """Returns condim, margin, friction and softness of contacts, as C mixes them."""

@@ -43,7 +43,10 @@ _SUMS = {
 #: What the physics reads, in the order of the operation's operands.
 _INPUTS = ("ctrl", "time", "qpos", "qvel", "act", "qacc_warmstart")
 #: What it computes for the task alone, where that reads it.
-_OUTPUTS = ("xpos", "xipos", "cinert", "cvel", "cfrc_ext")
+_OUTPUTS = (
+    *("xpos", "xipos", "cinert", "cvel", "cfrc_ext"),
+    *("seen_qpos", "seen_qvel", "seen_qacc", "touch"),
+)
 #: Where the device code has the fields of a simulation, by MuJoCo's names.
 _STATE = {field: f"s.{field}" for field in (*_INPUTS, *_OUTPUTS, "qfrc_actuator")}
 #: The operations that simulate, as the device code has them, and how often teams meet in them.

@@ -22,6 +22,39 @@ if reason := available.unavailable():
 if gpu_on_cpu.COMPILER is None:
     pytest.skip("there is no C++ compiler", allow_module_level=True)
 
+LEG = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="5 5 .1"/>
+    <body name="leg" pos="0 0 .45">
+      <joint type="slide" axis="0 0 1"/>
+      <joint name="turn" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".05"/>
+      <site name="foot" pos="0 0 -.4" euler="10 20 0" size=".06"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="turn" gear="3"/></actuator>
+  <sensor>
+    <gyro site="foot"/><accelerometer site="foot"/><force site="foot"/><touch site="foot"/>
+    <framequat objtype="site" objname="foot"/><velocimeter site="foot"/>
+  </sensor>
+</mujoco>"""
+
+
+class Leg(MujocoEnv):
+    """It observes what its sensors show, in parts of what they show at most."""
+
+    def initial(self, rng):
+        return jnp.array([-0.01, 0.1]), 0.3 * jax.random.normal(rng, (2,))
+
+    def observe(self, data):
+        foot = data.site("foot")
+        seen = [data.sensordata / (1 + jnp.abs(data.sensordata)), foot.xpos, foot.xmat.ravel()]
+        return jnp.concatenate(seen)
+
+    def outcome(self, before, data, action):
+        return jnp.sin(data.sensordata[0]), False, {}
+
 
 @pytest.fixture
 def teams(monkeypatch):
@@ -57,6 +90,21 @@ def test_teams_play_the_same_episodes(teams, name):
         np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
     assert np.abs(got.mask.sum(1) - want.mask.sum(1)).max() <= 3
     np.testing.assert_array_equal(got.simulated, got.mask.sum((1, 2)))
+
+
+@pytest.mark.slow
+def test_teams_show_sensors(teams):
+    spec = mujoco.MjSpec.from_string(LEG)
+    env = Leg(xml_file=spec, frame_skip=2, max_episode_steps=60, reward_threshold=None)
+    player = actor_and_act(env, (5,))
+    want = played(native.native_rollout, env, player, num_seeds=2)
+    made = teams()
+    got = played(native.native_rollout, env, player, num_seeds=2)
+    assert [kernel.launch.lanes for kernel in made] == [16, 16]
+    for name in ("observation", "reward"):
+        pair = (getattr(x, name)[:, :20] for x in (got, want))
+        np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
+    assert (want.observation[..., 9] > 0).any()  # touch
 
 
 def test_a_table_with_infinity_is_not_static():

@@ -80,14 +80,24 @@ def _exact(m: Any) -> Any:
 
 def _error(m: Any, play: Any, data: Any, skip: int) -> float:
     """Plays an env step here and in C; returns the largest error, relative where above 1."""
+    is_touch = m.sensor_type == _C.mjtSensor.mjSENS_TOUCH
     mine = {name: getattr(data, name).copy() for name in device_code.STATE}
     mine |= play(mine, data.ctrl, skip)
+    theirs = {}
     for _ in range(skip):
+        theirs |= {f"seen_{name}": getattr(data, name).copy() for name in ("qpos", "qvel")}
         _C.mj_step(m, data)
     _C.mj_rnePostConstraint(m, data)
+    theirs |= {"seen_qacc": data.qacc, "touch": data.sensordata[m.sensor_adr[is_touch]]}
+    if m.opt.integrator == _C.mjtIntegrator.mjINT_RK4:  # of its last stage C keeps the poses
+        last = _C.MjData(m)
+        last.qpos[:] = mine["seen_qpos"]
+        _C.mj_kinematics(m, last)
+        mine = {name: x for name, x in mine.items() if name not in theirs}
+        mine |= {"xquat": last.xquat.ravel(), "site_xpos": last.site_xpos.ravel()}
     errors = []
     for name, x in mine.items():
-        want = np.asarray(getattr(data, name)).ravel()
+        want = np.asarray(theirs[name] if name in theirs else getattr(data, name)).ravel()
         errors.append(np.abs(x - want).max(initial=0) / max(1, np.abs(want).max(initial=0)))
     return max(errors)
 

@@ -20,7 +20,11 @@ DEV int forward(const Team& team, const Model& M, State& s) {
   if (NE) general_rows(t, M, s);
   forces_and_inertia(t, M, s);
   collide(t, M, s);
-  return STOPS_EARLY ? newton_as_c(t, M, s) : newton(t, M, s);
+  const int steps = STOPS_EARLY ? newton_as_c(t, M, s) : newton(t, M, s), lane = t.lane;
+  if (reports(SEEN_QPOS)) EACH(i, NQ) s.seen_qpos[i] = s.qpos[i];
+  if (reports(SEEN_QVEL)) EACH(i, NV) s.seen_qvel[i] = s.qvel[i];
+  if (reports(SEEN_QACC)) EACH(i, NV) s.seen_qacc[i] = s.qacc_warmstart[i];
+  return steps;
 }
 
 // Moves positions, from start on, by a velocity for a time (mj_integratePos).
@@ -145,7 +149,7 @@ DEV bool physics(const Team& t, const Model& M, State& s, int skip) {
 }
 
 // What a task reads of the state that s.qpos and s.qvel are at, before any step: MuJoCo's
-// mj_forward, which leaves cfrc_ext zero.
+// mj_forward, which leaves cfrc_ext zero where no sensor needs it.
 DEV void start(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
   EACH(k, 12) s.pose[NL].row[k / 4].x[k % 4] = k % 5 == 0;
@@ -153,7 +157,7 @@ DEV void start(const Team& t, const Model& M, State& s) {
   t.sync();
   forward(t, M, s);
   report(t, M, s);
-  if (reports(CFRC_EXT)) EACH(n, 6 * NB) s.cfrc_ext[n] = 0;
+  if (reports(CFRC_EXT) && !SENSES_FORCES) EACH(n, 6 * NB) s.cfrc_ext[n] = 0;
   EACH(i, NV) s.qacc_warmstart[i] = 0;
   t.sync();
 }

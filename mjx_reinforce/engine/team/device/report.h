@@ -85,6 +85,7 @@ DEV void report(const Team& t, const Model& M, State& s) {
   }
   t.sync();
   if (reports(CFRC_EXT)) external_forces(t, M, s);
+  if constexpr (reports(TOUCH) && NTOUCH > 0) feel(t, M, s);
   if (SPATIAL) EACH(b, NB) {
     const int link = M.body_link[b];
     real com[3], arm[3], shift[3];
