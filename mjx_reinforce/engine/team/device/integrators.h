@@ -21,6 +21,7 @@ DEV int forward(const Team& team, const Model& M, State& s) {
   forces_and_inertia(t, M, s);
   collide(t, M, s);
   const int steps = STOPS_EARLY ? newton_as_c(t, M, s) : newton(t, M, s), lane = t.lane;
+  if (NLONE) turn_lone(t, M, s);  // before reports lie where M is
   if (reports(SEEN_QPOS)) EACH(i, NQ) s.seen_qpos[i] = s.qpos[i];
   if (reports(SEEN_QVEL)) EACH(i, NV) s.seen_qvel[i] = s.qvel[i];
   if (reports(SEEN_QACC)) EACH(i, NV) s.seen_qacc[i] = s.qacc_warmstart[i];
@@ -114,7 +115,6 @@ DEV void runge_kutta(const Team& t, const Model& M, State& s, bool last) {
 DEV void euler(const Team& t, const Model& M, State& s, bool last) {
   const int lane = t.lane;
   forward(t, M, s);
-  if (NLONE) turn_lone(t, M, s);
   const real* more = &s.direction[0].x[0];
   EACH(i, NV) s.qvel[i] += M.timestep * (s.qacc_warmstart[i] + (IMPLICIT ? more[i] : real(0)));
   t.sync();
