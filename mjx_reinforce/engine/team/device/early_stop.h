@@ -88,45 +88,77 @@ DEV Mark mark_at(const Team& t, const Model& M, State& s, const Search& search, 
           curvature > 0 ? curvature : real(1e-15)};
 }
 
+// Moves an end to the candidate on its side of the root that is nearest (updateBracket).
+DEV void move_inwards(Mark& end, const Mark& first, const Mark& second, const Mark& third) {
+  const auto try_mark = [&](const Mark& mark) {
+    if (mark.slope * end.slope > 0 && fabs(mark.slope) < fabs(end.slope)) end = mark;
+  };
+  try_mark(first);
+  try_mark(second);
+  try_mark(third);
+}
+
 // Where C's line search (PrimalSearch) ends: Newton steps along the line until the slope changes
-// its sign, then both ends of that interval move inwards.
+// its sign, then both ends of that interval move inwards. A round evaluates one length, so that the
+// code of mark_at, which is long, is there once.
 DEV Mark line_as_c(const Team& t, const Model& M, State& s, const Search& search, const Step& step,
                    real small) {
-  const auto at = [&](real length) { return mark_at(t, M, s, search, step, length); };
-  Mark high = at(0), low = at(high.next());
-  const real sign = low.slope < 0 ? real(1) : real(-1);
-  if (fabs(low.slope) < small && (low.length == 0 || low.cost < 0)) return low;
-  int lengths = 2;
-  LOOP while (low.slope * sign <= -small && lengths < LENGTHS) {
-    high = low;
-    low = at(low.next());
+  enum { AT_START, AT_NEWTON, FOLLOWS, AT_ROOT, AT_MIDDLE, AT_LOW_ROOT, AT_HIGH_ROOT };
+  int phase = AT_START, lengths = 0;
+  real length = 0, sign = 1;
+  bool moves_low = false, moves_high = false;
+  Mark low = {}, high = {}, low_root = {}, high_root = {};
+  LOOP for (;;) {
+    const Mark mark = mark_at(t, M, s, search, step, length);
     lengths++;
-    if (fabs(low.slope) < small && low.cost < 0) return low;
-  }
-  if (lengths >= LENGTHS) return low;
-  Mark ends[2] = {low, high}, roots[2] = {at(low.next()), low};
-  LOOP for (lengths++; lengths < LENGTHS; lengths++) {
-    const Mark middle = at((ends[0].length + ends[1].length) / 2);
-    const Mark candidates[3] = {roots[0], roots[1], middle};
-    const Mark* best = nullptr;
-    for (const Mark& mark : candidates)
-      if (fabs(mark.slope) < small && (!best || mark.cost < best->cost)) best = &mark;
-    if (best) return *best;
-    // Each end goes to the candidate on its side of the root that is nearest (updateBracket).
-    bool moved = false;
-    for (int k = 0; k < 2; k++) {
-      const real slope = ends[k].slope;
-      for (const Mark& mark : candidates)
-        if (mark.slope * ends[k].slope > 0 && fabs(mark.slope) < fabs(ends[k].slope))
-          ends[k] = mark;
-      if (ends[k].slope == slope) continue;
-      roots[k] = at(ends[k].next());
-      lengths++;
-      moved = true;
+    const bool flat = fabs(mark.slope) < small;
+    if (phase == AT_START) {
+      high = mark;
+      length = mark.next();
+      phase = AT_NEWTON;
+      continue;
     }
-    if (!moved) return middle;
+    if (phase <= FOLLOWS) {
+      if (flat && (mark.cost < 0 || (phase == AT_NEWTON && mark.length == 0))) return mark;
+      if (phase == AT_NEWTON) sign = mark.slope < 0 ? real(1) : real(-1);
+      if (phase == FOLLOWS) high = low;
+      low = mark;
+      if (lengths >= LENGTHS) return low;
+      phase = low.slope * sign <= -small ? FOLLOWS : AT_ROOT;
+      length = low.next();
+      continue;
+    }
+    if (phase == AT_MIDDLE) {
+      // Of those where the slope is zero the one of least cost; C looks at the middle last.
+      Mark best = low_root;
+      bool some = fabs(low_root.slope) < small;
+      if (fabs(high_root.slope) < small && (!some || high_root.cost < best.cost))
+        best = high_root, some = true;
+      if (flat && (!some || mark.cost < best.cost)) best = mark, some = true;
+      if (some) return best;
+      const Mark low_before = low, high_before = high;
+      move_inwards(low, low_root, high_root, mark);
+      move_inwards(high, low_root, high_root, mark);
+      moves_low = low.slope != low_before.slope;
+      moves_high = high.slope != high_before.slope;
+      if (!moves_low && !moves_high) return mark;
+    }
+    if (phase == AT_ROOT) low_root = mark, high_root = low;
+    if (phase == AT_LOW_ROOT) low_root = mark;
+    if (phase == AT_HIGH_ROOT) high_root = mark;
+    if (phase == AT_MIDDLE && moves_low) {
+      phase = AT_LOW_ROOT;
+      length = low.next();
+    } else if ((phase == AT_MIDDLE || phase == AT_LOW_ROOT) && moves_high) {
+      phase = AT_HIGH_ROOT;
+      length = high.next();
+    } else {
+      if (lengths >= LENGTHS) break;
+      phase = AT_MIDDLE;
+      length = (low.length + high.length) / 2;
+    }
   }
-  const Mark& end = ends[0].cost <= ends[1].cost ? ends[0] : ends[1];
+  const Mark end = low.cost <= high.cost ? low : high;
   return end.cost < 0 ? end : Mark{0, 0, 0, 0};
 }
 
