@@ -19,6 +19,7 @@ class Launch(NamedTuple):
     scratch: 4-byte words of a buffer that each thread needs
     lanes: threads that play an episode together
     shared: bytes of shared memory of a block
+    many: threads of a block where items are many; 0 are as ``threads``
     """
 
     threads: int
@@ -26,6 +27,7 @@ class Launch(NamedTuple):
     scratch: int = 0
     lanes: int = 1
     shared: int = 0
+    many: int = 0
 
 
 class Source(NamedTuple):

@@ -22,7 +22,7 @@ from mjx_reinforce.engine.team.text import CText
 #: Warps of a block where there are few episodes, whose threads have 128 registers each.
 FEW_WARPS = 16
 #: Where there are many, whose threads have 80.
-_MANY_WARPS = 24
+MANY_WARPS = 24
 #: The arguments of a step behind the actor and the state: keys, t, deterministic.
 _NUM_OTHERS = 3
 
@@ -43,6 +43,7 @@ class Physics(NamedTuple):
     skip: physics steps of an env step
     lanes: of a team
     shared: bytes of shared memory that a block may have
+    warps: of a block where items are many; see ``for_items``
     """
 
     text: str
@@ -50,6 +51,7 @@ class Physics(NamedTuple):
     skip: int
     lanes: int
     shared: int
+    warps: int = FEW_WARPS
 
 
 _PLAY_LOOP = """
@@ -249,6 +251,7 @@ def _kernel(physics: Physics, text: CText, loop: str, words: int) -> Source:
         scratch=thread_words,
         lanes=physics.lanes,
         shared=physics.shared,
+        many=WARP * physics.warps,
     )
     macros = f"#define REPORTS ({' | '.join(text.reports) or 0})\n#define FAR_WORDS {physics.far}\n"
     return Source("cuda", f"{macros}{physics.text}\n{loop}", launch)
@@ -265,8 +268,9 @@ def for_items(kernel: ptx.Kernel, num_items: int, processors: int, capability: s
     """
     # Where a team of the small blocks has one episode at most, more teams would have none.
     launch = kernel.launch
-    if num_items * launch.lanes <= launch.threads * processors:
+    is_small = num_items * launch.lanes <= launch.threads * processors
+    if is_small or launch.many in (0, launch.threads):
         return kernel
-    source = kernel.source._replace(launch=launch._replace(threads=WARP * _MANY_WARPS))
-    name = f"{kernel.key} {_MANY_WARPS} warps"
+    source = kernel.source._replace(launch=launch._replace(threads=launch.many))
+    name = f"{kernel.key} {launch.many} threads"
     return ptx.load_kernel(name, lambda: source, capability, objects.folder())

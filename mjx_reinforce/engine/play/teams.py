@@ -5,7 +5,7 @@ from typing import Any
 
 from mjx_reinforce.engine.base import PhysicsModel
 from mjx_reinforce.engine.gpu import nvrtc
-from mjx_reinforce.engine.gpu.team_kernel import Physics
+from mjx_reinforce.engine.gpu.team_kernel import FEW_WARPS, MANY_WARPS, Physics
 
 #: Models of fewer degrees of freedom play faster by a thread an episode.
 _LEAST_DOFS = 14
@@ -53,12 +53,17 @@ def team_physics(model: PhysicsModel) -> Physics:
     """Returns the physics of a model that teams play."""
     from mjx_reinforce.engine.team import tables
 
+    lanes = _lanes(model)
+    # Where a lane has two rows of the Newton step's matrix it needs more registers than the threads
+    # of many warps have, and as many states do not fit into shared memory.
+    has_room = model.mj_model.nv < lanes
     return Physics(
         text=tables.physics_text(model.mj_model),
         far=tables.far_words(model.mj_model),
         skip=model.frame_skip,
-        lanes=_lanes(model),
+        lanes=lanes,
         shared=_shared_memory(),
+        warps=MANY_WARPS if has_room else FEW_WARPS,
     )
 
 
