@@ -217,9 +217,12 @@ def until(stream: IO[str] | None, word: str) -> bool:
 def go(process: subprocess.Popen[str], seconds: float) -> list[str]:
     """Lets a process time, for so long at most; returns what it printed."""
     try:
-        return process.communicate("go\n", timeout=seconds)[0].splitlines()
+        lines = process.communicate("go\n", timeout=seconds)[0].splitlines()
     except subprocess.TimeoutExpired:
         return ["no time left"]
+    # A compiler or driver that ends the process says nothing.
+    failure = f"ended with exit status {process.returncode}"
+    return [*lines, failure] if process.returncode else lines
 
 
 def work(settings: Settings) -> None:
