@@ -36,7 +36,7 @@ Readings: TypeAlias = dict[str, Any]
 def rne_postconstraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Computes cfrc_ext, cfrc_int and cacc, as ``mj_rnePostConstraint``."""
     model, reduced_data = _existing(model, data)
-    return _like(mjx.rne_postconstraint(model, _with_tendons(model, reduced_data)), data)
+    return _like(mjx.rne_postconstraint(model, with_tendons(model, reduced_data)), data)
 
 
 def sensor_acc(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -44,7 +44,7 @@ def sensor_acc(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     model, reduced_data = _existing(model, data)
     # These read ``cacc`` and ``cfrc_int``, for which MJX calls its ``rne_postconstraint``.
     if np.isin(model.sensor_type, BODY_TYPES).any():
-        reduced_data = _with_tendons(model, reduced_data)
+        reduced_data = with_tendons(model, reduced_data)
     # MJX fails on sensors of contacts where there can be none; left out, they show zero.
     if not jax_fields(reduced_data).contact.dim.size:
         is_contact = np.isin(model.sensor_type, _CONTACT_TYPES)
@@ -97,7 +97,7 @@ def _existing(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Model, mjx.Data]:
     return model, data
 
 
-def _with_tendons(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+def with_tendons(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Returns the data with the forces of spatial tendons among the forces applied to bodies."""
     if not np.isin(mjx.WrapType.SITE, model.wrap_type):
         return data

@@ -84,6 +84,8 @@ def shown(mj_model: MjModel, model: mjx.Model, data: mjx.Data, touch: jax.Array)
     torque, force = jnp.split(impl.cfrc_ext, 2, axis=1)
     arm = data.subtree_com[model.body_rootid] - data.xipos
     wrench = jnp.concatenate([force, torque + jnp.cross(arm, force)], axis=1)
+    # Spatial tendons are among these already, and ``sensor_acc`` adds them.
+    wrench -= sensors.with_tendons(model, data.replace(xfrc_applied=0 * wrench)).xfrc_applied
     empty = jax.tree.map(lambda x: x[:0], impl.contact)
     data = with_fields(data, contact=empty.replace(dim=impl.contact.dim[:0]))
     data = sensors.sensor_acc(

@@ -35,7 +35,11 @@ ROBOT = """
     </body>
     <body name="weight" pos="0 .4 .3"><freejoint/><geom name="weight" size=".05"/></body>
   </worldbody>
-  <tendon><spatial name="t"><site site="imu"/><site site="foot"/></spatial></tendon>
+  <tendon>
+    <spatial name="t" stiffness="50" springlength=".1">
+      <site site="imu"/><site site="foot"/>
+    </spatial>
+  </tendon>
   <actuator><position name="m" joint="knee" kp="20"/></actuator>
   <equality><connect body1="weight" body2="trunk" anchor=".05 0 0"/></equality>
   <sensor>
