@@ -11,16 +11,22 @@ from mjx_reinforce.engine.base import MjModel
 _C: Any = mujoco
 _DISABLED: Any = _C.mjtDisableBit
 _ENABLED: Any = _C.mjtEnableBit
+#: Without these an actuator pushes nothing. Its gear stays: by its square joints and tendons inherit
+#: armature and damping of actuators that are disabled, too (mj_actuatorArmature).
+_FORCES = ("actuator_gainprm", "actuator_biasprm")
 #: Flags of <option> that disable terms, and the fields that are zero without these.
 _TERMS = {
     "equality": ("eq_active0",),
     "frictionloss": ("dof_frictionloss", "tendon_frictionloss"),
     "limit": ("jnt_limited", "tendon_limited"),
     "spring": ("jnt_stiffness", "jnt_stiffnesspoly", "tendon_stiffness", "tendon_stiffnesspoly"),
-    "damper": ("dof_damping", "dof_dampingpoly", "tendon_damping", "tendon_dampingpoly"),
+    "damper": (
+        *("dof_damping", "dof_dampingpoly", "tendon_damping", "tendon_dampingpoly"),
+        *("actuator_damping", "actuator_dampingpoly"),
+    ),
     "gravity": ("body_gravcomp",),
     "clampctrl": ("actuator_ctrllimited",),
-    "actuation": ("actuator_gear", "jnt_actfrclimited", "tendon_actfrclimited"),
+    "actuation": (*_FORCES, "actuator_forcelimited", "jnt_actfrclimited", "tendon_actfrclimited"),
 }
 #: Groups of actuators that can be disabled.
 _MAX_GROUPS = 31
@@ -59,8 +65,9 @@ def without_disabled(mj_model: MjModel) -> Any:
     if is_off(model, "spring") and is_off(model, "damper"):
         model.body_gravcomp[:] = 0
         model.opt.density = model.opt.viscosity = 0
-    # An actuator without gear pushes nothing (mj_actuatorDisabled).
     groups = np.clip(model.actuator_group, -1, _MAX_GROUPS)
     disabled_groups = (model.opt.disableactuator >> np.arange(_MAX_GROUPS) & 1).astype(bool)
-    model.actuator_gear[np.append(disabled_groups, [False, False])[groups]] = 0
+    is_disabled = np.append(disabled_groups, [False, False])[groups]  # mj_actuatorDisabled
+    for field in _FORCES:
+        getattr(model, field)[is_disabled] = 0
     return model

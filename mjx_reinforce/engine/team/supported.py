@@ -123,7 +123,8 @@ def _lacking_actuators(model: Any) -> Iterable[tuple[str, Any]]:
     # MuJoCo takes the representative of their control that is nearest.
     joints = np.where(np.isin(kinds, joint_types), model.actuator_trnid[:, 0], 0)
     is_of_ball = np.isin(kinds, joint_types) & (model.jnt_type[joints] == BALL)
-    is_servo = model.actuator_gainprm[:, 0] == -model.actuator_biasprm[:, 1]
+    stiffness = model.actuator_gainprm[:, 0]
+    is_servo = (stiffness != 0) & (stiffness == -model.actuator_biasprm[:, 1])
     yield "servos of ball joints", np.any(is_of_ball & is_servo)
     gains = np.isin(model.actuator_gaintype, (_C.mjtGain.mjGAIN_FIXED, _C.mjtGain.mjGAIN_AFFINE))
     biases = np.isin(model.actuator_biastype, (_C.mjtBias.mjBIAS_NONE, _C.mjtBias.mjBIAS_AFFINE))

@@ -348,7 +348,8 @@ class _Tables:
         acts = np.asarray(model.jnt_actgravcomp, bool)[self.dof_joint] & bool(held_links)
         self.ints["dof_acts_held"] = acts if held_links else []
         self.constants["NHELD"] = len(held_links)
-        self.constants["ACTS_HELD"] = int(acts.any() and model.nu > 0)
+        has_actuators = model.nu > 0 and not flags.is_off(model, "actuation")
+        self.constants["ACTS_HELD"] = int(acts.any() and has_actuators)
 
     def _medium(self) -> None:
         """Makes the tables of what a medium does to bodies, in the order of their links."""

@@ -184,7 +184,7 @@ DEV void subtract_forces(const Team& t, const Model& M, State& s, real (&gradien
   }
 }
 
-// As begin_step. A search that stops early leaves a gradient, of which implicit damping takes part.
+// As begin_step.
 DEV void begin_step_as_c(const Team& t, const Model& M, State& s, Search& search, bool starts,
                          bool damps) {
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
@@ -192,11 +192,19 @@ DEV void begin_step_as_c(const Team& t, const Model& M, State& s, Search& search
     real stiffness = 0;
     search.gradient[r] = search.imbalance[r];
     if (!starts) search.bounds[r].push(search.qacc[r], search.gradient[r], stiffness);
-    if (damps) {
-      stiffness = i < NV ? M.timestep * s.drag[i] : real(0);
-      search.gradient[r] += stiffness * search.qacc[r];
-    }
+    if (damps) stiffness = i < NV ? M.timestep * s.drag[i] : real(0);
     if (i < NV) s.rows[i][i / 4].x[i % 4] = search.diagonal[r] + stiffness;
+  }
+}
+
+// A search that stops early leaves a gradient, of which implicit damping takes part, and turn_lone
+// in s.imbalance.
+DEV void damp_rest(const Team& t, const Model& M, State& s, Search& search) {
+  UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+    const int i = t.lane + r * W;
+    if (i >= NV) continue;
+    if (NLONE) s.imbalance[i] = search.gradient[r];
+    search.gradient[r] += M.timestep * s.drag[i] * search.qacc[r];
   }
 }
 
@@ -219,6 +227,7 @@ DEV int newton_as_c(const Team& t, const Model& M, State& s) {
     load_rows(t, s, h);
     if (damps) {
       subtract_forces(t, M, s, search.gradient);
+      damp_rest(t, M, s, search);
       if (IMPLICIT == 2 && NCABLE) damp_cables(t, M, s, search.qacc, search.gradient, h);
     } else if (!starts) {
       add_rows(t, M, s, h, search.gradient);

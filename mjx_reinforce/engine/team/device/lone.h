@@ -47,7 +47,7 @@ DEV void turn_lone(const Team& t, const Model& M, State& s) {
           a[r][c] += weight * cable.moment[j / 4].x[j % 4];
         }
       }
-      right[r] = 0;
+      right[r] = STOPS_EARLY ? -s.imbalance[i] : real(0);
       UNROLL for (int c = 0; c < 6; c++) {
         const int j = first + c, low = r < c ? i : j, high = r < c ? j : i;
         right[r] -= a[r][c] * s.qacc_warmstart[j];
