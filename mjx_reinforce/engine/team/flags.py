@@ -11,8 +11,8 @@ from mjx_reinforce.engine.base import MjModel
 _C: Any = mujoco
 _DISABLED: Any = _C.mjtDisableBit
 _ENABLED: Any = _C.mjtEnableBit
-#: Without these an actuator pushes nothing. Its gear stays: by its square joints and tendons inherit
-#: armature and damping of actuators that are disabled, too (mj_actuatorArmature).
+#: Without these an actuator pushes nothing. Its gear stays: by its square, joints and tendons
+#: inherit armature and damping of actuators that are disabled, too (mj_actuatorArmature).
 _FORCES = ("actuator_gainprm", "actuator_biasprm")
 #: Flags of <option> that disable terms, and the fields that are zero without these.
 _TERMS = {
