@@ -240,8 +240,11 @@ class _Tables:
         if opt.integrator == _C.mjtIntegrator.mjINT_IMPLICITFAST:
             return 2
         is_euler = opt.integrator == _C.mjtIntegrator.mjINT_EULER
-        is_implicit = is_euler and not flags.is_off(self.model, "eulerdamp")
-        return int(is_implicit and self.damping.any())
+        is_off = any(flags.is_off(self.model, x) for x in ("eulerdamp", "damper"))
+        # With the armature of an actuator, C solves once more (mj_EulerSkip): this only matters for
+        # a search that stops early.
+        solves_again = stops_early(self.model) and np.any(self.model.jnt_actuatorid != -1)
+        return int(is_euler and not is_off and (self.damping.any() or solves_again))
 
     def _records(self, name: str, order: Any = slice(None), **columns: np.ndarray) -> None:
         """Makes a table of structs from the columns of their fields, [rows] or [rows, numbers]."""
