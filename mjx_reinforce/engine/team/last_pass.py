@@ -17,6 +17,7 @@ from mujoco import mjx
 from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.physics import sensors
 from mjx_reinforce.engine.physics.mjx_internals import Simulation, jax_fields, with_fields
+from mjx_reinforce.engine.team import flags
 
 _C: Any = mujoco  # a C extension without stubs
 _FIELDS = frozenset(
@@ -53,6 +54,8 @@ def _shows_sensors(mj_model: MjModel) -> bool:
     # In C the sensors of a Runge-Kutta step show its first stage, which is not its last pass.
     is_rk4 = model.opt.integrator == _C.mjtIntegrator.mjINT_RK4
     is_unknown = np.isin(model.sensor_type, (types.mjSENS_CONTACT, types.mjSENS_CLOCK))
+    if flags.is_off(model, "sensor"):
+        return False
     return not (is_rk4 or is_unknown.any()) and len(touch_sensors(model)) == num_touches
 
 

@@ -15,7 +15,7 @@ from mjx_reinforce.envs import models
 
 ROBOT = """
 <mujoco>
-  <option timestep=".004" {option}/>
+  <option timestep=".004" {option}>{flags}</option>
   <worldbody>
     <camera name="eye" pos="1 0 1"/>
     <geom type="plane" size="5 5 .1"/>
@@ -60,7 +60,7 @@ ROBOT = """
 </mujoco>"""
 FIELDS = ("xquat", "xmat", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "xaxis", "xanchor")
 FIELDS += ("cam_xpos", "subtree_com", "ten_length", "actuator_length", "actuator_force")
-PARTS = {"option": "", "zone": "sphere", "more": ""}
+PARTS = {"option": "", "flags": "", "zone": "sphere", "more": ""}
 
 
 @pytest.mark.parametrize("option", ["", 'integrator="implicitfast"'])
@@ -99,6 +99,7 @@ def test_fields_and_sensors_are_those_of_c(option):
     "part",
     [
         {"option": 'integrator="RK4"'},
+        {"flags": '<flag sensor="disable"/>'},
         {"zone": "capsule"},
         {"more": "<clock/>"},
         {"more": '<contact geom1="weight" data="found"/>'},
