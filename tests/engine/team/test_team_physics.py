@@ -7,7 +7,7 @@ step from so many states of a task's random play.
 import sys
 import tempfile
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ needs_compiler = pytest.mark.skipif(device_code.COMPILER is None, reason="there 
 
 _OWN = str(Path(__file__).parents[3] / "experiments" / "examples" / "quadruped")
 _MODELS = tomllib.loads((Path(__file__).parent / "models.toml").read_text("utf-8"))
+_QUICK = ("limits", "condim 6 and 4", "elliptic cones, condim 1 and 3", "boxes on boxes", "3 steps")
 _MANY = '<geom size=".1"/>'
 _TWO = """
 <mujoco>
@@ -70,6 +71,11 @@ def _model(
     rest = f"<actuator>{actuator}</actuator>" if actuator else ""
     given = {"option": "", "geoms": geoms, "rest": rest, **parts, "world": world}
     return _C.MjModel.from_xml_string(_MODELS["scene"].format_map(given))
+
+
+def _marked(names: Iterable[str]) -> list[Any]:
+    """Returns tests by their names, of which a newcomer runs a few: each compiles a program."""
+    return [pytest.param(x, marks=[] if x in _QUICK else pytest.mark.slow) for x in names]
 
 
 def _exact(m: Any) -> Any:
@@ -142,14 +148,14 @@ def test_lanes_in_any_order_play_alike(task, lanes, tmp_path):
 
 
 @needs_compiler
-@pytest.mark.parametrize("feature", _MODELS["features"])
+@pytest.mark.parametrize("feature", _marked(_MODELS["features"]))
 def test_features(feature, tmp_path):
     m = _model(**_MODELS["features"][feature])
     assert _largest_error(_exact(m), tmp_path, skip=3, starts=3) < 1e-9
 
 
 @needs_compiler
-@pytest.mark.parametrize("limits", _MODELS["early"])
+@pytest.mark.parametrize("limits", _marked(_MODELS["early"]))
 def test_a_search_that_stops_early_ends_where_c_ends(limits, tmp_path):
     m = _model(**_MODELS["early"][limits])
     assert _largest_error(m, tmp_path, skip=3, starts=3) < 1e-9
