@@ -395,7 +395,7 @@ class MujocoEnv(Env):
 
     @functools.cached_property
     def _shown(self) -> Callable[..., Any]:
-        return jax.jit(functools.partial(last_pass.shown, self.mj_model, self.model))
+        return jax.jit(functools.partial(last_pass.completed_data, self.mj_model, self.model))
 
     def _whole(self, name: str, start: mjx.Data) -> tuple[Any, jax.Array]:
         """Returns what an operation of the device code makes of a simulation; whether it is sound.
@@ -410,7 +410,7 @@ class MujocoEnv(Env):
         operands = [getattr(start, field) for field in ("ctrl", *models.CARRIED)]
         digest = self.physics_model().digest
         touch = jnp.zeros(len(last_pass.touch_sensors(self.mj_model)), start.qpos.dtype)
-        last = {"seen_qpos": start.qpos, "seen_qvel": start.qvel, "seen_qacc": start.qacc}
+        last = {"pass_qpos": start.qpos, "pass_qvel": start.qvel, "pass_qacc": start.qacc}
         last |= {"touch": touch, "sound": sound}
         outputs = whole(name, results | last, *operands, model=digest)
         # In the order of ``results``, which is that of the tree's leaves.

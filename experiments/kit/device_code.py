@@ -30,8 +30,8 @@ def report_sizes(model: Any) -> dict[str, int]:
     of_a_body = {"xpos": 3, "xipos": 3, "cinert": 10, "cvel": 6, "cfrc_ext": 6}
     sizes = {name: size * model.nbody for name, size in of_a_body.items()}
     num_touches = int(np.sum(model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH))
-    sizes |= {"qfrc_actuator": model.nv, "seen_qpos": model.nq, "seen_qvel": model.nv}
-    return sizes | {"seen_qacc": model.nv, "touch": num_touches}
+    sizes |= {"qfrc_actuator": model.nv, "pass_qpos": model.nq, "pass_qvel": model.nv}
+    return sizes | {"pass_qacc": model.nv, "touch": num_touches}
 
 
 def compiled(model: Any, folder: Path, num_near: int = tables.NUM_NEAR, lanes: int = 1) -> Steps:

@@ -24,9 +24,9 @@ extern "C" int play_steps(double* qpos, double* qvel, double* qacc, const double
   for (int i = 0; i < 6 * NB; i++) *out++ = s.cvel[i];
   for (int i = 0; i < 6 * NB; i++) *out++ = s.cfrc_ext[i];
   for (int i = 0; i < NV; i++) *out++ = s.qfrc_actuator[i];
-  for (int i = 0; i < NQ; i++) *out++ = s.seen_qpos[i];
-  for (int i = 0; i < NV; i++) *out++ = s.seen_qvel[i];
-  for (int i = 0; i < NV; i++) *out++ = s.seen_qacc[i];
+  for (int i = 0; i < NQ; i++) *out++ = s.pass_qpos[i];
+  for (int i = 0; i < NV; i++) *out++ = s.pass_qvel[i];
+  for (int i = 0; i < NV; i++) *out++ = s.pass_qacc[i];
   for (int i = 0; i < NTOUCH; i++) *out++ = s.touch[i];
   return sound;
 }

@@ -19,7 +19,7 @@ class Launch(NamedTuple):
     scratch: 4-byte words of a buffer that each thread needs
     lanes: threads that play an episode together
     shared: bytes of shared memory of a block
-    many: threads of a block where items are many; 0 are as ``threads``
+    most_threads: threads of a block where items are many; 0 are as ``threads``
     """
 
     threads: int
@@ -27,7 +27,7 @@ class Launch(NamedTuple):
     scratch: int = 0
     lanes: int = 1
     shared: int = 0
-    many: int = 0
+    most_threads: int = 0
 
 
 class Source(NamedTuple):

@@ -251,7 +251,7 @@ def _kernel(physics: Physics, text: CText, loop: str, words: int) -> Source:
         scratch=thread_words,
         lanes=physics.lanes,
         shared=physics.shared,
-        many=WARP * physics.warps,
+        most_threads=WARP * physics.warps,
     )
     macros = f"#define REPORTS ({' | '.join(text.reports) or 0})\n#define FAR_WORDS {physics.far}\n"
     return Source("cuda", f"{macros}{physics.text}\n{loop}", launch)
@@ -269,8 +269,8 @@ def for_items(kernel: ptx.Kernel, num_items: int, processors: int, capability: s
     # Where a team of the small blocks has one episode at most, more teams would have none.
     launch = kernel.launch
     is_small = num_items * launch.lanes <= launch.threads * processors
-    if is_small or launch.many in (0, launch.threads):
+    if is_small or launch.most_threads in (0, launch.threads):
         return kernel
-    source = kernel.source._replace(launch=launch._replace(threads=launch.many))
-    name = f"{kernel.key} {launch.many} threads"
+    source = kernel.source._replace(launch=launch._replace(threads=launch.most_threads))
+    name = f"{kernel.key} {launch.most_threads} threads"
     return ptx.load_kernel(name, lambda: source, capability, objects.folder())

@@ -59,7 +59,9 @@ def _shows_sensors(mj_model: MjModel) -> bool:
     return not (is_rk4 or is_unknown.any()) and len(touch_sensors(model)) == num_touches
 
 
-def shown(mj_model: MjModel, model: mjx.Model, data: mjx.Data, touch: jax.Array) -> mjx.Data:
+def completed_data(
+    mj_model: MjModel, model: mjx.Model, data: mjx.Data, touch: jax.Array
+) -> mjx.Data:
     """Returns the data with all fields of ``Completed``.
 
     Args:
@@ -109,7 +111,7 @@ class Completed(Simulation):
         Args:
           mj_model: the model.
           data: what is known.
-          complete: returns ``shown`` of its last forward pass.
+          complete: returns ``completed_data`` of its last forward pass.
         """
         super().__init__(data)
         self._names = _FIELDS | {"sensordata"} if _shows_sensors(mj_model) else _FIELDS

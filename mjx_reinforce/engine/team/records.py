@@ -44,7 +44,7 @@ FIELDS = {
     "Part": {"at": 3, "gear": 6},
     "Tendon": {"stiffness": 3, "damping": 3, "rest": 2},
     "Law": {"stiffness": 3, "damping": 3},
-    "Wet": {
+    "FluidBody": {
         "at": 3,
         "axes": 9,
         "viscous_torque": 1,
@@ -52,7 +52,7 @@ FIELDS = {
         "drag_torque": 3,
         "drag_force": 3,
     },
-    "Held": {"moment": 3, "mass": 1},
+    "Compensation": {"moment": 3, "mass": 1},
 }
 #: The structs of the tables whose rows are some.
 STRUCTS = {
@@ -69,8 +69,8 @@ STRUCTS = {
     "tendon": "Tendon",
     "bound": "Limit",
     "dof_law": "Law",
-    "wet": "Wet",
-    "held": "Held",
+    "fluid_body": "FluidBody",
+    "compensated": "Compensation",
 }
 
 

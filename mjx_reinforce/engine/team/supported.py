@@ -141,11 +141,16 @@ def _lacking_contacts(model: Any) -> Iterable[tuple[str, Any]]:
     num_items = 0
     for pair in meeting(model):
         kinds = geom_kinds(model, pair)
-        geom_names = [_C.mjtGeom(x).name.removeprefix("mjGEOM_").lower() for x in kinds]
-        yield f"a {geom_names[1]} that meets a {geom_names[0]}", kinds not in NUM_PARTS
+        flat_name, round_name = map(_geom_name, kinds)
+        yield f"{round_name} that meets {flat_name}", kinds not in NUM_PARTS
         # A kind that is lacking does not get here: ``why`` stops at the first one.
         num_items += NUM_PARTS[kinds]
     yield f"more than {_MAX_ITEMS} possible contacts", num_items > _MAX_ITEMS
+
+
+def _geom_name(kind: int) -> str:
+    name = _C.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
+    return f"an {name}" if name == "ellipsoid" else f"a {name}"
 
 
 def pulling_tendons(model: Any) -> list[int]:

@@ -7,7 +7,7 @@ anchors have fixed places in the frames of links.
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,6 +17,12 @@ from mjx_reinforce.engine.physics import sensors
 from mjx_reinforce.engine.physics.early_stop import stops_early
 from mjx_reinforce.engine.scalar import UnsupportedPrimitive
 from mjx_reinforce.engine.team import cables, flags, last_pass, records, supported
+from mjx_reinforce.engine.team.contact_kinds import (
+    MIN_VALUE,
+    ContactKind,
+    contact_kind,
+    softness_of,
+)
 from mjx_reinforce.engine.team.frames import Frame, Inertial, rotation, six, times
 from mjx_reinforce.engine.team.records import Softness
 from mjx_reinforce.engine.team.supported import (
@@ -59,7 +65,7 @@ _HEADERS = [
     "early_stop",
     "touch",
     "report",
-    "lone",
+    "free_bodies",
     "integrators",
     "scalar",
     "launch",
@@ -70,29 +76,7 @@ NUM_NEAR = 8
 _TURNS, _SHIFTS, _SHIFTS_IN_THE_WORLD = range(3)
 #: Geoms by the enum of ``device/rounds.h``.
 _GEOM_KINDS = {PLANE: 0, SPHERE: 1, CAPSULE: 1, BOX: 2, CYLINDER: 3, ELLIPSOID: 4}
-#: MuJoCo's mjMINVAL, mjMINMU, mjMINIMP and mjMAXIMP.
-_MIN_VALUE = 1e-15
-_MIN_FRICTION = 1e-5
-_MIN_IMPEDANCE = 1e-4
-_MAX_IMPEDANCE = 1 - 1e-4
 _NO_LIMIT = 1e30
-
-
-class _ContactKind(NamedTuple):
-    """What contacts of many pairs have in common.
-
-    dim: MuJoCo's condim
-    margin: (m)
-    friction: along the two tangents, about the normal, about the two tangents
-    soft: the number of the softness
-    soft_friction: that of the rows of friction of an elliptic cone
-    """
-
-    dim: int
-    margin: float
-    friction: tuple[float, ...]
-    soft: int
-    soft_friction: int
 
 
 def physics_text(mj_model: MjModel, num_near: int = NUM_NEAR) -> str:
@@ -149,7 +133,7 @@ class _Tables:
         self._links()
         self._bodies()
         self._dofs()
-        self._held()
+        self._compensation()
         self._medium()
         self._cables()
         self._actuators()
@@ -165,7 +149,7 @@ class _Tables:
         self.constants["NB"] = model.nbody
         self.constants["NU"] = max(model.nu, 1)
         self.constants["IMPLICIT"] = self._implicit()
-        is_passive = any(self.constants[x] for x in ("NHELD", "TENSE", "SPRUNG"))
+        is_passive = any(self.constants[x] for x in ("NCOMPENSATED", "TENDON_FORCES", "JOINT_LAWS"))
         self.constants["PASSIVE"] = int(is_passive)
         self.constants["RK4"] = int(model.opt.integrator == _C.mjtIntegrator.mjINT_RK4)
         self.constants["ELLIPTIC"] = self._is_elliptic()
@@ -324,7 +308,7 @@ class _Tables:
             com = np.zeros(3)
             if link_bodies and mass != 0:
                 mass_moments = (model.body_mass[x] * bodies[x].com for x in link_bodies)
-                com = sum(mass_moments, start=np.zeros(3)) / max(mass, _MIN_VALUE)
+                com = sum(mass_moments, start=np.zeros(3)) / max(mass, MIN_VALUE)
             inertia = np.zeros((3, 3))
             for x in link_bodies:  # the parallel axis theorem
                 arm = bodies[x].com - com
@@ -336,42 +320,42 @@ class _Tables:
         self.reals["link_com"] = [x.com for x in links]
         self.reals["link_inertia"] = [six(x.inertia) for x in links]
 
-    def _held(self) -> None:
+    def _compensation(self) -> None:
         """Makes the tables of what gravity compensation holds, a row a link."""
         model = self.model
-        held_masses = model.body_mass * model.body_gravcomp
-        held_links: dict[int, np.ndarray] = {}
-        for frame, mass, ipos in zip(self.frames, held_masses, model.body_ipos, strict=True):
+        masses = model.body_mass * model.body_gravcomp
+        weights: dict[int, np.ndarray] = {}
+        for frame, mass, ipos in zip(self.frames, masses, model.body_ipos, strict=True):
             if mass and frame.link >= 0:
                 row = mass * np.array([*frame.place(ipos), 1])
-                held_links[frame.link] = held_links.get(frame.link, 0) + row
-        self.ints["held_link"] = list(held_links)
-        self.reals["held"] = list(held_links.values())
+                weights[frame.link] = weights.get(frame.link, 0) + row
+        self.ints["compensated_link"] = list(weights)
+        self.reals["compensated"] = list(weights.values())
         # Of these joints the actuators' force includes it; without an actuator there is none.
-        acts = np.asarray(model.jnt_actgravcomp, bool)[self.dof_joint] & bool(held_links)
-        self.ints["dof_acts_held"] = acts if held_links else []
-        self.constants["NHELD"] = len(held_links)
+        acts = np.asarray(model.jnt_actgravcomp, bool)[self.dof_joint] & bool(weights)
+        self.ints["dof_actuator_compensation"] = acts if weights else []
+        self.constants["NCOMPENSATED"] = len(weights)
         has_actuators = model.nu > 0 and not flags.is_off(model, "actuation")
-        self.constants["ACTS_HELD"] = int(acts.any() and has_actuators)
+        self.constants["ACTUATOR_COMPENSATION"] = int(acts.any() and has_actuators)
 
     def _medium(self) -> None:
         """Makes the tables of what a medium does to bodies, in the order of their links."""
         model = self.model
         opt = model.opt
         links = np.array([self._link_number(x.link) for x in self.frames])
-        bodies = np.flatnonzero((model.body_mass >= _MIN_VALUE) & (links < model.njnt))
+        bodies = np.flatnonzero((model.body_mass >= MIN_VALUE) & (links < model.njnt))
         bodies = bodies[np.argsort(links[bodies], kind="stable")]
         has_medium = opt.density > 0 or opt.viscosity > 0
         self.constants["MEDIUM"] = int(has_medium)
-        self.ints["link_wet"] = []
-        self.reals |= {"wet": [], "wind": []}
+        self.ints["link_fluid"] = []
+        self.reals |= {"fluid_body": [], "wind": []}
         if not has_medium:
             return
         # A body is a box of the same inertia, or, where the medium is viscous, a ball.
         inertia = model.body_inertia[bodies]
         squares = inertia.sum(1, keepdims=True) - 2 * inertia
         masses = model.body_mass[bodies, None]
-        box = np.sqrt(np.maximum(_MIN_VALUE, squares) / masses * 6)
+        box = np.sqrt(np.maximum(MIN_VALUE, squares) / masses * 6)
         diameter = box.mean(1)
         others = box[:, [[1, 2], [0, 2], [0, 1]]]
         turns = [
@@ -379,7 +363,7 @@ class _Tables:
             for x in bodies
         ]
         self._records(
-            "wet",
+            "fluid_body",
             at=np.array([self.frames[x].place(model.body_ipos[x]) for x in bodies]),
             axes=np.array(turns),
             viscous_torque=np.pi * opt.viscosity * diameter**3,
@@ -387,7 +371,7 @@ class _Tables:
             drag_torque=opt.density / 64 * box * (others**4).sum(2),
             drag_force=opt.density / 2 * others.prod(2),
         )
-        self.ints["link_wet"] = np.searchsorted(links[bodies], np.arange(model.njnt + 1))
+        self.ints["link_fluid"] = np.searchsorted(links[bodies], np.arange(model.njnt + 1))
         self.reals["wind"] = opt.wind
 
     def _dofs(self) -> None:
@@ -420,7 +404,7 @@ class _Tables:
         laws = np.column_stack([model.jnt_stiffness, model.jnt_stiffnesspoly])[joint]
         laws = np.hstack([laws, self.damping])
         laws[is_single, 0] = laws[:, 3] = 0
-        self.constants["SPRUNG"] = int(laws.any())
+        self.constants["JOINT_LAWS"] = int(laws.any())
         self.reals["dof_law"] = laws if laws.any() else []
         self.reals["rest"] = model.qpos_spring if laws.any() else []
         self.reals["dof_spring"] = model.qpos_spring[qpos]
@@ -428,9 +412,9 @@ class _Tables:
         # Free bodies without others in their tree, which implicitfast turns in a way of its own.
         is_alone = np.bincount(model.dof_treeid, minlength=1)[model.dof_treeid] == 6
         is_lone = (model.jnt_type == FREE) & is_alone[model.jnt_dofadr]
-        lone_links = np.flatnonzero(is_lone) if self._implicit() == 2 else []
-        self.ints["lone_link"] = lone_links
-        self.constants["NLONE"] = len(lone_links)
+        free_links = np.flatnonzero(is_lone) if self._implicit() == 2 else []
+        self.ints["free_link"] = free_links
+        self.constants["NFREE"] = len(free_links)
         self.functions["dof_parent"] = model.dof_parentid
         self.functions["last_of_link"] = np.where(np.diff(joint, append=-1), joint, -1)
         self._chains(dof_kinds)
@@ -488,30 +472,12 @@ class _Tables:
         return [self._soft(ref, imp) if is_present else 0 for ref, imp, is_present in rows]
 
     def _soft(self, solref: np.ndarray, solimp: np.ndarray) -> int:
-        """Returns the number of MuJoCo's K, B and impedance of rows with these parameters."""
-        # As getsolparam and mj_makeImpedance of engine_core_constraint.c: solref is a time constant
-        # and a damping ratio, or, where negative, stiffness and damping themselves.
-        ref = np.array(solref, float)
-        imp = np.array(solimp, float)
-        if (ref[0] > 0) != (ref[1] > 0):
-            ref = np.array([0.02, 1])
-        if ref[0] > 0 and not flags.is_off(self.model, "refsafe"):
-            ref[0] = max(ref[0], 2 * self.model.opt.timestep)
-        dmin, dmax, midpoint = np.clip(imp[[0, 1, 3]], _MIN_IMPEDANCE, _MAX_IMPEDANCE)
-        width = max(imp[2], 0)
-        power = max(imp[4], 1)
-        if ref[0] > 0:
-            stiffness = 1 / max(_MIN_VALUE, dmax**2 * ref[0] ** 2 * ref[1] ** 2)
-            damping = 2 / max(_MIN_VALUE, dmax * ref[0])
-        else:
-            stiffness = -ref[0] / dmax**2
-            damping = -ref[1] / dmax
-        if dmin == dmax or width <= _MIN_VALUE:
-            # Without a width the impedance is the mean everywhere; 1 keeps the division sound.
-            dmin = dmax = (dmin + dmax) / 2
-            width = 1.0
-        softness = Softness(stiffness, damping, dmin, dmax - dmin, width, midpoint, power)
-        return self.soft.setdefault(Softness(*map(float, softness)), len(self.soft))
+        """Returns the number of the softness of rows with these parameters."""
+        return self._number(softness_of(self.model, solref, solimp))
+
+    def _number(self, softness: Softness) -> int:
+        """Returns the number of a softness, a new one where it was not met before."""
+        return self.soft.setdefault(softness, len(self.soft))
 
     def _cables(self) -> None:
         """Makes the tables of cables."""
@@ -528,7 +494,7 @@ class _Tables:
         self.reals["part"] = [(*x.at, *x.gear) for x in parts]
         tendons = [cables.spring(model, x.tendon) for x in self.cables]
         is_tense = any(any(x[:6]) for x in tendons)
-        self.constants["TENSE"] = int(is_tense)
+        self.constants["TENDON_FORCES"] = int(is_tense)
         self.reals["tendon"] = tendons if is_tense else []
         self.constants["NCABLE"] = len(self.cables)
 
@@ -665,47 +631,47 @@ class _Tables:
     def _pairs(self, num_near: int) -> None:
         """Makes the tables of geoms that may meet."""
         model = self.model
-        pairs = [(pair, self._contact_kind(pair)) for pair in supported.meeting(model)]
+        pairs = [(pair, contact_kind(model, pair)) for pair in supported.meeting(model)]
         geoms = sorted({geom for pair, _ in pairs for geom in (pair.geom1, pair.geom2)})
         geom_ids = {geom: number for number, geom in enumerate(geoms)}
-        kind_numbers: dict[_ContactKind, int] = {}
+        kind_numbers: dict[ContactKind, int] = {}
         kind_pairs = 0
         items = []
         item_kinds = []
         weights = []
-        for pair, contact_kind in pairs:
-            kind = kind_numbers.setdefault(contact_kind, len(kind_numbers))
+        for pair, kind in pairs:
+            number = kind_numbers.setdefault(kind, len(kind_numbers))
             bodies = model.geom_bodyid[[pair.geom1, pair.geom2]]
             weight = sum(model.body_invweight0[body, 0] for body in bodies)
-            if contact_kind.dim > 1 and not self._is_elliptic():
+            if kind.dim > 1 and not self._is_elliptic():
                 # Of an edge of the pyramid, which pushes along a tangent, too.
-                friction = contact_kind.friction[0]
+                friction = kind.friction[0]
                 weight *= 2 * friction**2 / model.opt.impratio * (1 + friction**2)
             flat, other = geom_types = supported.geom_kinds(model, pair)
             kind_pairs |= 1 << (8 * _GEOM_KINDS[flat] + _GEOM_KINDS[other])
             for part in range(supported.NUM_PARTS[geom_types]):
                 items.append(records.packed_item(geom_ids[pair.geom1], geom_ids[pair.geom2], part))
-                item_kinds.append(kind)
+                item_kinds.append(number)
                 weights.append(weight)
         self.ints["item"] = items
         self.ints["item_kind"] = item_kinds
         self.reals["item_weight"] = weights
-        rows = list(kind_numbers) or [_ContactKind(1, 0.0, (0.0,) * 5, 0, 0)]
-        self.ints["kind_dim"] = [x.dim for x in rows]
-        self.ints["kind_soft"] = [x.soft for x in rows]
-        self.reals["kind_margin"] = [x.margin for x in rows]
-        self.reals["kind_friction"] = [x.friction for x in rows]
+        kinds = list(kind_numbers)
+        self.ints["kind_dim"] = [x.dim for x in kinds]
+        self.ints["kind_soft"] = [self._number(x.softness) for x in kinds]
+        self.reals["kind_margin"] = [x.margin for x in kinds]
+        self.reals["kind_friction"] = [x.friction for x in kinds]
         self.reals["kind_mu"] = []
         self.ints["kind_soft_friction"] = []
         if self._is_elliptic():
             # C's regularized friction of the cone.
-            root = np.sqrt(max(model.opt.impratio, _MIN_VALUE))
-            self.reals["kind_mu"] = [x.friction[0] / root for x in rows]
-            self.ints["kind_soft_friction"] = [x.soft_friction for x in rows]
+            root = np.sqrt(max(model.opt.impratio, MIN_VALUE))
+            self.reals["kind_mu"] = [x.friction[0] / root for x in kinds]
+            self.ints["kind_soft_friction"] = [self._number(x.friction_softness) for x in kinds]
         self.constants["KIND_PAIRS"] = kind_pairs
         self.constants["NI"] = len(items)
         self.constants["NEAR"] = max(1, min(num_near, len(items)))
-        self.constants["CD"] = max(x.dim for x in rows)
+        self.constants["CD"] = max((x.dim for x in kinds), default=1)
         self.constants["NG"] = max(len(geoms), 1)
         self._geoms(np.array(geoms, int))
 
@@ -761,51 +727,3 @@ class _Tables:
         self.reals["touch_at"] = [frame.pos for frame in frames]
         self.reals["touch_turn"] = [rotation(frame.quat) for frame in frames]
         self.reals["touch_size"] = size
-
-    def _contact_kind(self, pair: supported.GeomPair) -> _ContactKind:
-        """Returns condim, margin, friction and softness of contacts, as C mixes them."""
-        model = self.model
-        if pair.pair >= 0:
-            ref = model.pair_solref[pair.pair]
-            friction_ref = model.pair_solreffriction[pair.pair]
-            imp = model.pair_solimp[pair.pair]
-            return _ContactKind(
-                dim=int(model.pair_dim[pair.pair]),
-                margin=float(model.pair_margin[pair.pair]),
-                friction=_friction(model.pair_friction[pair.pair]),
-                soft=self._soft(ref, imp),
-                soft_friction=self._soft(friction_ref if friction_ref.any() else ref, imp),
-            )
-        # mj_contactParam: the geom of higher priority decides alone.
-        geoms = [pair.geom1, pair.geom2]
-        priority = model.geom_priority[geoms]
-        if priority[0] != priority[1]:
-            geom = geoms[priority.argmax()]
-            dim = model.geom_condim[geom]
-            friction = model.geom_friction[geom]
-            ref = model.geom_solref[geom]
-            imp = model.geom_solimp[geom]
-        else:
-            dim = model.geom_condim[geoms].max()
-            friction = model.geom_friction[geoms].max(0)
-            solmix = np.where(model.geom_solmix[geoms] < _MIN_VALUE, 0, model.geom_solmix[geoms])
-            share = solmix[0] / solmix.sum() if solmix.any() else 0.5
-            refs = model.geom_solref[geoms]
-            imps = model.geom_solimp[geoms]
-            # Stiffness itself and a time constant do not mix: C takes the smaller numbers.
-            is_direct = (refs[:, 0] <= 0).any()
-            ref = refs.min(0) if is_direct else share * refs[0] + (1 - share) * refs[1]
-            imp = share * imps[0] + (1 - share) * imps[1]
-        soft = self._soft(ref, imp)
-        return _ContactKind(
-            dim=int(dim),
-            margin=float(model.geom_margin[geoms].sum()),
-            friction=_friction(friction[[0, 0, 1, 2, 2]]),
-            soft=soft,
-            soft_friction=soft,
-        )
-
-
-def _friction(coefficients: np.ndarray) -> tuple[float, ...]:
-    """Returns the friction of a contact; less than MuJoCo's mjMINMU is mjMINMU."""
-    return tuple(map(float, np.maximum(coefficients, _MIN_FRICTION)))

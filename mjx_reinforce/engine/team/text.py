@@ -45,7 +45,7 @@ _INPUTS = ("ctrl", "time", "qpos", "qvel", "act", "qacc_warmstart")
 #: What it computes for the task alone, where that reads it.
 _OUTPUTS = (
     *("xpos", "xipos", "cinert", "cvel", "cfrc_ext"),
-    *("seen_qpos", "seen_qvel", "seen_qacc", "touch"),
+    *("pass_qpos", "pass_qvel", "pass_qacc", "touch"),
 )
 #: Where the device code has the fields of a simulation, by MuJoCo's names.
 _STATE = {field: f"s.{field}" for field in (*_INPUTS, *_OUTPUTS, "qfrc_actuator")}

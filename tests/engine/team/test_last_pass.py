@@ -76,7 +76,7 @@ def test_fields_and_sensors_are_those_of_c(option):
         @functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
         def shown(fields, cfrc_ext, touch):
             known = with_fields(start.replace(**fields), cfrc_ext=cfrc_ext)
-            complete = last_pass.shown(model, in_mjx, known, touch)
+            complete = last_pass.completed_data(model, in_mjx, known, touch)
             completed = last_pass.Completed(model, known, lambda: complete)
             return {name: getattr(completed, name) for name in (*FIELDS, "sensordata")}
 

@@ -91,13 +91,13 @@ def _error(m: Any, play: Any, data: Any, skip: int) -> float:
     mine |= play(mine, data.ctrl, skip)
     theirs = {}
     for _ in range(skip):
-        theirs |= {f"seen_{name}": getattr(data, name).copy() for name in ("qpos", "qvel")}
+        theirs |= {f"pass_{name}": getattr(data, name).copy() for name in ("qpos", "qvel")}
         _C.mj_step(m, data)
     _C.mj_rnePostConstraint(m, data)
-    theirs |= {"seen_qacc": data.qacc, "touch": data.sensordata[m.sensor_adr[is_touch]]}
+    theirs |= {"pass_qacc": data.qacc, "touch": data.sensordata[m.sensor_adr[is_touch]]}
     if m.opt.integrator == _C.mjtIntegrator.mjINT_RK4:  # of its last stage C keeps the poses
         last = _C.MjData(m)
-        last.qpos[:] = mine["seen_qpos"]
+        last.qpos[:] = mine["pass_qpos"]
         _C.mj_kinematics(m, last)
         mine = {name: x for name, x in mine.items() if name not in theirs}
         mine |= {"xquat": last.xquat.ravel(), "site_xpos": last.site_xpos.ravel()}

@@ -152,7 +152,7 @@ DEV real general_force(const Model& M, const State& s, int e, real& stiffness) {
 DEV real whole_force(const Model& M, const State& s, int c) {
   const Cable& cable = s.cables[c];
   real sum = cable.force, stiffness;
-  if (TENSE) sum += tension(M.tendon[c], cable.length, cable.speed);
+  if (TENDON_FORCES) sum += tension(M.tendon[c], cable.length, cable.speed);
   for (int n = 0; n < NLIMITED + NLOSS; n++) {
     if (M.bound_cable[n] != c) continue;
     const real force = general_force(M, s, NE - NLIMITED - NLOSS + n, stiffness);

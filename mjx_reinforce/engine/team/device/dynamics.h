@@ -35,7 +35,7 @@ DEV void actuate(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
   EACH(n, NCABLE) {
     Cable& cable = s.cables[n];
-    real force = 0, drag = TENSE ? polynomial_rate(M.tendon[n].damping, fabs(cable.speed)) : real(0);
+    real force = 0, drag = TENDON_FORCES ? polynomial_rate(M.tendon[n].damping, fabs(cable.speed)) : real(0);
     drive(M, s, NV + n, cable.length, cable.speed, force, drag);
     cable.force = force;
     cable.drag = drag;
@@ -43,11 +43,11 @@ DEV void actuate(const Team& t, const Model& M, State& s) {
   if (NCABLE) t.sync();
   EACH(i, NV) {
     const real damping =
-        M.dof_damping[i] + (SPRUNG ? polynomial_rate(M.dof_law[i].damping, fabs(s.qvel[i])) : real(0));
+        M.dof_damping[i] + (JOINT_LAWS ? polynomial_rate(M.dof_law[i].damping, fabs(s.qvel[i])) : real(0));
     real force = 0, drag = damping;
     drive(M, s, i, s.qpos[M.dof_qpos[i]], s.qvel[i], force, drag);
     for (int n = 0; n < NCABLE; n++) force += s.cables[n].moment[i / 4].x[i % 4] * s.cables[n].force;
-    if (ACTS_HELD && M.dof_acts_held[i]) force += compensation(M, s, i);
+    if (ACTUATOR_COMPENSATION && M.dof_actuator_compensation[i]) force += compensation(M, s, i);
     const Range range = M.dof_force[i];
     const bool bounded = IMPLICIT == 1 || force <= range.low || force >= range.high;
     if (IMPLICIT) s.drag[i] = bounded ? damping : drag;

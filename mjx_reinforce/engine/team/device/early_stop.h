@@ -197,20 +197,19 @@ DEV void begin_step_as_c(const Team& t, const Model& M, State& s, Search& search
   }
 }
 
-// A search that stops early leaves a gradient, of which implicit damping takes part, and turn_lone
+// A search that stops early leaves a gradient, of which implicit damping takes part, and turn_free_bodies
 // in s.imbalance.
 DEV void damp_rest(const Team& t, const Model& M, State& s, Search& search) {
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
     const int i = t.lane + r * W;
     if (i >= NV) continue;
-    if (NLONE) s.imbalance[i] = search.gradient[r];
+    if (NFREE) s.imbalance[i] = search.gradient[r];
     search.gradient[r] += M.timestep * s.drag[i] * search.qacc[r];
   }
 }
 
 // Replaces newton, and returns as that.
 DEV int newton_as_c(const Team& t, const Model& M, State& s) {
-  const int lane = t.lane;
   Search search(t, M, s);
   real trace = 0, improvement = 0;
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++) trace += search.diagonal[r];
@@ -266,19 +265,11 @@ DEV int newton_as_c(const Team& t, const Model& M, State& s) {
       improvement = -mark.cost;
     }
     t.sync();
-    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
-      search.qacc[r] += mark.length * search.direction[r];
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
       search.imbalance[r] += mark.length * inertia[r];
-    }
-    each_contact(t, s, [&](Contact& c) {
-      for (int k = 0; k < CD; k++) c.residual[k] += mark.length * c.change[k];
-    });
-    EACH(e, NE) s.general_residual[e] += mark.length * s.general_change[e];
-    t.sync();
+    move_along(t, s, search, mark.length);
     if (settled && !IMPLICIT) break;
   }
-  UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
-    if (lane + r * W < NV) s.qacc_warmstart[lane + r * W] = search.qacc[r];
-  t.sync();
+  store_acceleration(t, s, search);
   return steps + 1;
 }

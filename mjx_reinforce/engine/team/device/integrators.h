@@ -21,10 +21,10 @@ DEV int forward(const Team& team, const Model& M, State& s) {
   forces_and_inertia(t, M, s);
   collide(t, M, s);
   const int steps = STOPS_EARLY ? newton_as_c(t, M, s) : newton(t, M, s), lane = t.lane;
-  if (NLONE) turn_lone(t, M, s);  // before reports lie where M is
-  if (reports(SEEN_QPOS)) EACH(i, NQ) s.seen_qpos[i] = s.qpos[i];
-  if (reports(SEEN_QVEL)) EACH(i, NV) s.seen_qvel[i] = s.qvel[i];
-  if (reports(SEEN_QACC)) EACH(i, NV) s.seen_qacc[i] = s.qacc_warmstart[i];
+  if (NFREE) turn_free_bodies(t, M, s);  // before reports lie where M is
+  if (reports(PASS_QPOS)) EACH(i, NQ) s.pass_qpos[i] = s.qpos[i];
+  if (reports(PASS_QVEL)) EACH(i, NV) s.pass_qvel[i] = s.qvel[i];
+  if (reports(PASS_QACC)) EACH(i, NV) s.pass_qacc[i] = s.qacc_warmstart[i];
   return steps;
 }
 

@@ -239,10 +239,25 @@ DEV void follow(const Team& t, const Model& M, State& s, Search& search, real le
   if (NLIMITED + NLOSS) t.sync();  // before the residuals, which say what pushes, change
 }
 
+// Moves the acceleration and the residuals along the direction.
+DEV void move_along(const Team& t, State& s, Search& search, real length) {
+  const int lane = t.lane;
+  UNROLL for (int r = 0; r < ROWS_A_LANE; r++) search.qacc[r] += length * search.direction[r];
+  each_contact(t, s, [&](Contact& c) {
+    for (int k = 0; k < CD; k++) c.residual[k] += length * c.change[k];
+  });
+  EACH(e, NE) s.general_residual[e] += length * s.general_change[e];
+  t.sync();
+}
+DEV void store_acceleration(const Team& t, State& s, const Search& search) {
+  UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
+    if (t.lane + r * W < NV) s.qacc_warmstart[t.lane + r * W] = search.qacc[r];
+  t.sync();
+}
+
 // Replaces s.qacc_warmstart by the acceleration (MuJoCo's mj_solNewton); if damping is implicit,
 // s.direction becomes what that adds to it. Returns the number of steps.
 DEV int newton(const Team& t, const Model& M, State& s) {
-  const int lane = t.lane;
   Search search(t, M, s);
   bool settled = false;
   int steps = 0;
@@ -286,16 +301,9 @@ DEV int newton(const Team& t, const Model& M, State& s) {
         follow(t, M, s, search, length);
       }
     }
-    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) search.qacc[r] += length * search.direction[r];
-    each_contact(t, s, [&](Contact& c) {
-      for (int k = 0; k < CD; k++) c.residual[k] += length * c.change[k];
-    });
-    EACH(e, NE) s.general_residual[e] += length * s.general_change[e];
-    t.sync();
+    move_along(t, s, search, length);
     if (settled && !IMPLICIT) break;
   }
-  UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
-    if (lane + r * W < NV) s.qacc_warmstart[lane + r * W] = search.qacc[r];
-  t.sync();
+  store_acceleration(t, s, search);
   return steps + 1;
 }

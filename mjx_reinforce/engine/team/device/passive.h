@@ -5,16 +5,16 @@
 DEV real compensation(const Model& M, const State& s, int i) {
   const real* moves = s.cdof[i][0].x;
   real sum = 0;
-  LOOP for (int n = 0; n < NHELD; n++) {
-    const int link = M.held_link[n];
+  LOOP for (int n = 0; n < NCOMPENSATED; n++) {
+    const int link = M.compensated_link[n];
     if (!(M.link_dofs[link] >> i & 1)) continue;
-    const Held& held = M.held[n];
+    const Compensation& weight = M.compensated[n];
     const Pose& p = s.pose[link];
     real moment[3], torque[3];
-    p.turn(moment, held.moment);
-    for (int k = 0; k < 3; k++) moment[k] += held.mass * (p.origin(k) - s.pose[0].origin(k));
+    p.turn(moment, weight.moment);
+    for (int k = 0; k < 3; k++) moment[k] += weight.mass * (p.origin(k) - s.pose[0].origin(k));
     cross(torque, moment, M.gravity);
-    sum -= dot(moves, torque) + held.mass * dot(moves + 3, M.gravity);
+    sum -= dot(moves, torque) + weight.mass * dot(moves + 3, M.gravity);
   }
   return sum;
 }
@@ -44,18 +44,18 @@ DEV real sprung(const Model& M, const State& s, int i) {
 // (mj_inertiaBoxFluidModel).
 DEV void subtract_medium(const Model& M, const State& s, int link, real* force) {
   const real* v = s.velocity[link];
-  LOOP for (int b = M.link_wet[link]; b < M.link_wet[link + 1]; b++) {
-    const Wet& wet = M.wet[b];
+  LOOP for (int b = M.link_fluid[link]; b < M.link_fluid[link + 1]; b++) {
+    const FluidBody& body = M.fluid_body[b];
     real at[3], speed[3], moment[3], push[3] = {}, torque[3] = {};
-    place_of(s, link, wet.at, at);
+    place_of(s, link, body.at, at);
     cross(speed, v, at);
     for (int k = 0; k < 3; k++) speed[k] += v[3 + k] - M.wind[k];
     for (int k = 0; k < 3; k++) {
       real axis[3];
-      s.pose[link].turn(axis, wet.axes + 3 * k);
+      s.pose[link].turn(axis, body.axes + 3 * k);
       const real turns = dot(v, axis), moves = dot(speed, axis);
-      const real resists = turns * (wet.viscous_torque + wet.drag_torque[k] * fabs(turns));
-      const real holds = moves * (wet.viscous_force + wet.drag_force[k] * fabs(moves));
+      const real resists = turns * (body.viscous_torque + body.drag_torque[k] * fabs(turns));
+      const real holds = moves * (body.viscous_force + body.drag_force[k] * fabs(moves));
       for (int j = 0; j < 3; j++) torque[j] += resists * axis[j], push[j] += holds * axis[j];
     }
     cross(moment, at, push);
@@ -70,9 +70,9 @@ DEV void subtract_medium(const Model& M, const State& s, int link, real* force) 
 DEV void passive(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
   EACH(i, NV) {
-    real force = SPRUNG ? sprung(M, s, i) : real(0);
-    if (NHELD && !M.dof_acts_held[i]) force += compensation(M, s, i);
-    for (int n = 0; n < NCABLE && TENSE; n++) {
+    real force = JOINT_LAWS ? sprung(M, s, i) : real(0);
+    if (NCOMPENSATED && !M.dof_actuator_compensation[i]) force += compensation(M, s, i);
+    for (int n = 0; n < NCABLE && TENDON_FORCES; n++) {
       const Cable& cable = s.cables[n];
       force += cable.moment[i / 4].x[i % 4] * tension(M.tendon[n], cable.length, cable.speed);
     }

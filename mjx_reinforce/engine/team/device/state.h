@@ -30,7 +30,7 @@ constexpr int FAR = NI > NEAR ? NI - NEAR : 0;
 // SEEN_ is of its last forward pass.
 enum Report {
   XPOS = 1, XIPOS = 2, CINERT = 4, CVEL = 8, CFRC_EXT = 16,
-  SEEN_QPOS = 32, SEEN_QVEL = 64, SEEN_QACC = 128, TOUCH = 256
+  PASS_QPOS = 32, PASS_QVEL = 64, PASS_QACC = 128, TOUCH = 256
 };
 #ifndef REPORTS
 #define REPORTS 511
@@ -82,8 +82,8 @@ struct alignas(4 * sizeof(real)) State {
     struct {
       real xpos[room(XPOS, 3)], xipos[room(XIPOS | CINERT | CVEL | CFRC_EXT, 3)];
       real cinert[room(CINERT, 10)], cvel[room(CVEL, 6)], cfrc_ext[room(CFRC_EXT, 6)];
-      real seen_qpos[reports(SEEN_QPOS) ? NQ : 1], seen_qvel[reports(SEEN_QVEL) ? NV : 1];
-      real seen_qacc[reports(SEEN_QACC) ? NV : 1], touch[reports(TOUCH) && NTOUCH ? NTOUCH : 1];
+      real pass_qpos[reports(PASS_QPOS) ? NQ : 1], pass_qvel[reports(PASS_QVEL) ? NV : 1];
+      real pass_qacc[reports(PASS_QACC) ? NV : 1], touch[reports(TOUCH) && NTOUCH ? NTOUCH : 1];
     };
   };
   union {

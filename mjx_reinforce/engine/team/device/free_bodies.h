@@ -5,11 +5,11 @@
 
 // Replaces what implicit damping adds to their accelerations. The inertia, and implicit damping of
 // single degrees of freedom on its diagonal, are in s.rows.
-DEV void turn_lone(const Team& t, const Model& M, State& s) {
+DEV void turn_free_bodies(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
   real* more = &s.direction[0].x[0];
-  EACH(n, NLONE) {
-    const int link = M.lone_link[n], first = M.link_dof[link];
+  EACH(n, NFREE) {
+    const int link = M.free_link[n], first = M.link_dof[link];
     const real *w = s.qvel + first + 3, *center = M.link_com + 3 * link;
     const real *inertia = M.link_inertia + 6 * link, mass = M.link_mass[link], h = M.timestep;
     // What is beyond M, and from there on the right side and all of the matrix.
