@@ -38,6 +38,7 @@ def write_models(folder):
     (folder / "other.xml").write_text("<robots/>")
 
 
+@pytest.mark.slow
 def test_each_model_has_a_row_and_is_judged_once(tmp_path):
     write_models(tmp_path / "package" / "assets")
     path = tmp_path / "rows.csv"

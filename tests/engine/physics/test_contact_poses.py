@@ -127,6 +127,7 @@ ELLIPTIC = """
 </mujoco>"""
 
 
+@pytest.mark.slow
 def test_elliptic_cones_with_contacts_that_are_none():
     model = mujoco.MjModel.from_xml_string(ELLIPTIC)
     data = mujoco.MjData(model)

@@ -71,6 +71,7 @@ def errors(shown, model, start, steps):
     return max(np.abs(x - y).max() for x, y in zip(ours, (qpos, qvel), strict=True)), far
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("native", [False, True])
 def test_more_contacts_than_room_end_where_c_does(native):
     """As Playground's ball_in_cup."""

@@ -152,6 +152,7 @@ class Pulled(MujocoEnv):
         return 0.0, False, {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["spring and damper", "armature"])
 def test_contact_forces_are_those_of_c_after_a_step(name):
     model, data = of(name)

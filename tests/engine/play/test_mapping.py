@@ -63,6 +63,7 @@ def test_a_loop_reads_what_one_before_it_has_kept():
     np.testing.assert_allclose(got, jax.vmap(sums)(x), rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_loops_may_keep_more_than_a_stack_has_room_for():
     """Some 25 MB for 16 lanes: without the heap, the process ends."""
 
