@@ -243,7 +243,8 @@ def load(
     def write_gpu() -> Source:
         expansion, title = write()
         kernel_source = writers.gpu(expansion)
-        return kernel_source._replace(text=title + kernel_source.text)
+        comment = "//" if kernel_source.language == "cuda" else ""
+        return kernel_source._replace(text=comment + title + kernel_source.text)
 
     capability = gpu_seam.compute_capability()
     return ptx.load_kernel(source, write_gpu, capability, objects.folder()), shapes

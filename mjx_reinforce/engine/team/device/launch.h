@@ -8,14 +8,19 @@ static_assert(FAR * sizeof(Contact) <= sizeof(real) * (FAR_WORDS), "no room for 
 #ifdef __CUDACC__
 #define KERNEL __global__ void __launch_bounds__(WARPS * 32, 1)
 __device__ const Model MODEL MODEL_INIT;
-struct Shared { Model m; State s[TEAMS]; };
+struct Shared { Model m; State s[W > 1 ? TEAMS : 1]; };
+#if W == 1
+#define OWN_STATE static_assert(sizeof(Shared) <= SHARED, "no room for the model"); State s;
+#else
+#define OWN_STATE State& s = shared.s[team];
+#endif
 extern __shared__ __align__(16) char shared_bytes[];
 
 struct Player : Team {
   DEV int next(int* counter) const {
     int k = 0;
     if (lane == 0) k = atomicAdd(counter, 1);
-    return __shfl_sync(mask, k, 0, W);
+    return from(k, 0);
   }
   DEV bool some(bool flag) const { return __any_sync(0xffffffffu, flag); }  // of the warp
   // Goes to so many meetings, for a warp that has nothing to play.
@@ -33,7 +38,7 @@ struct Player : Team {
   const int team = threadIdx.x / W;                                                         \
   if (team >= TEAMS) return;                                                                \
   const Model& M = shared.m;                                                                \
-  State& s = shared.s[team];                                                                \
+  OWN_STATE                                                                                 \
   const Player t;                                                                           \
   const int lane = t.lane;                                                                  \
   scratch += size_t(blockIdx.x * (blockDim.x / W) + team) * (THREAD_WORDS * W);               \
