@@ -198,9 +198,15 @@ def make(key: str, folder: Path | None, text: str, compile: Callable[[str], byte
     seconds = time.perf_counter() - start
     title = text.partition("\n")[0].removeprefix("; ")
     describe(key, f"{title}; LLVM took {seconds:.2f} s for {len(content):,} bytes")
-    if folder:
-        write_object(folder, key, content)
-        if is_described():
-            with contextlib.suppress(OSError):
-                (folder / f"{key}.ll").write_text(text, encoding="utf-8")
+    keep(key, folder, content, text, ".ll")
     return content
+
+
+def keep(key: str, folder: Path | None, content: bytes, text: str, suffix: str) -> None:
+    """Keeps an object, and where objects are described the text that it is made of beside it."""
+    if folder is None:
+        return
+    write_object(folder, key, content)
+    if is_described():
+        with contextlib.suppress(OSError):
+            (folder / f"{key}{suffix}").write_text(text, encoding="utf-8")

@@ -13,25 +13,35 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.special
 
-from mjx_reinforce.engine.cpu import machine
-from mjx_reinforce.engine.gpu import ptx, seam
-from mjx_reinforce.engine.gpu.kernel import ENTRY
-from mjx_reinforce.engine.gpu.source import Launch
+from mjx_reinforce.engine.gpu import cubin, seam
+from mjx_reinforce.engine.gpu.loops import ENTRY
 from mjx_reinforce.engine.play import available
 
 #: A compiler of C++, if there is one.
 COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
-_SOME = re.compile(r'call i32 asm sideeffect "[^"]*bar.red[^"]*", "=r,r"\(i32 (%\w+)\) convergent')
-_ALL = re.compile(r'call void asm sideeffect "[^"]*bar.sync[^\n]*')
 #: What C++ has on a GPU alone.
 _ERFINV = ctypes.CFUNCTYPE(ctypes.c_float, ctypes.c_float)(lambda x: float(scipy.special.erfinv(x)))
 _THREAD = threading.local()
-#: What a thread asks, in blocks of 32.
+#: What a thread asks: its number, and how many there are.
 _NUMBERS = {
-    "tid": ctypes.CFUNCTYPE(ctypes.c_int)(lambda: _THREAD.number % 32),
-    "ctaid": ctypes.CFUNCTYPE(ctypes.c_int)(lambda: _THREAD.number // 32),
-    "ntid": ctypes.CFUNCTYPE(ctypes.c_int)(lambda: 32),
+    "first": ctypes.CFUNCTYPE(ctypes.c_int)(lambda: _THREAD.number),
+    "stride": ctypes.CFUNCTYPE(ctypes.c_int)(lambda: _THREAD.threads),
 }
+#: What a thread is on a CPU; see ``thread.h``. Others meet where the text says so.
+_PLAYER = """
+#define KERNEL void
+struct Player {{
+  static constexpr int lane = 0;
+  bool meet(bool flag) const {{ return flag; }}
+  void gather() const {{}}
+  void sync() const {{}}
+  int next(int* counter) const {{ return __atomic_fetch_add(counter, 1, __ATOMIC_RELAXED); }}
+  void add(int* sum, int x) const {{ __atomic_fetch_add(sum, x, __ATOMIC_RELAXED); }}
+  int first() const {{ return ((int (*)()){first}ull)(); }}
+  int stride() const {{ return ((int (*)()){stride}ull)(); }}
+}};
+"""
+_MEETING = re.compile(r"\bt\.(?:meet\(|(gather)\()")
 
 
 class Block:
@@ -48,15 +58,15 @@ class Block:
         self._meet = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int, ctypes.c_int)(self._come)
 
     def text(self, text):
-        """Returns LLVM IR that meets here instead."""
-        address = ctypes.cast(self._meet, ctypes.c_void_p).value
+        """Returns C++ that meets here instead, at places with numbers."""
         places = iter(range(10**6))
 
-        def call(flag):
-            where = f"inttoptr (i64 {address} to ptr)"
-            return f"call i32 {where}(i32 {next(places)}, i32 {flag})"
+        def call(found):
+            return f"MEET({next(places)}, {'false' * bool(found[1])}"
 
-        return _ALL.sub(lambda _: call("0"), _SOME.sub(lambda found: call(found[1]), text))
+        address = ctypes.cast(self._meet, ctypes.c_void_p).value
+        macro = f"#define MEET(place, flag) ((int (*)(int, int)){address}ull)(place, flag)\n"
+        return macro + _MEETING.sub(call, text)
 
     def _all_here(self):
         self.meetings += 1
@@ -76,31 +86,22 @@ class Block:
         return 0 if self.apart else self._some
 
 
-def as_for_a_cpu(text, block=None):
-    """Returns a kernel's LLVM IR, with threads that meet in a block, or each in a block alone."""
-    text = text.replace("define ptx_kernel void", "define void").replace(") #0 {", ") {")
-    text = re.sub(r"attributes #0 = \{[^}]*\}", "", text)
-    for name, function in _NUMBERS.items():
-        address = ctypes.cast(function, ctypes.c_void_p).value
-        asked = f"call i32 @llvm.nvvm.read.ptx.sreg.{name}.x()"
-        text = text.replace(asked, f"call i32 inttoptr (i64 {address} to ptr)()")
-    return block.text(text) if block else _ALL.sub("", _SOME.sub(r"or i32 \1, 0", text))
+def compiled(source, block=None):
+    """Returns the address of a kernel for this CPU, where each team has one lane.
 
-
-def compiled(text, block=None):
-    """Returns a kernel's code for this CPU."""
-    text = as_for_a_cpu(text, block)
-    return machine.load_module(text, lambda: text, (ENTRY,), machine.this_machine(), None)
-
-
-def compiled_team(source):
-    """Returns the address of a kernel in CUDA C++, compiled with one lane for this CPU."""
+    Threads meet in a block, or each in a block alone.
+    """
+    text = source._replace(launch=source.launch._replace(lanes=1)).for_compiler()
+    if block:
+        text = block.text(text)
+    if source.launch.lanes == 1:
+        addresses = {k: ctypes.cast(f, ctypes.c_void_p).value for k, f in _NUMBERS.items()}
+        text = _PLAYER.format(**addresses) + text
+    address = ctypes.cast(_ERFINV, ctypes.c_void_p).value
+    text = f"#define erfinvf(x) ((float (*)(float)){address}ull)(x)\n{text}"
+    options = ("-std=c++17", "-O1", "-shared", "-fPIC", "-w", "-DREAL=float", "-x", "c++", "-")
     with tempfile.TemporaryDirectory() as folder:
         library = f"{folder}/play.so"
-        options = ("-std=c++17", "-O1", "-shared", "-fPIC", "-w", "-DREAL=float", "-x", "c++", "-")
-        address = ctypes.cast(_ERFINV, ctypes.c_void_p).value
-        text = source._replace(launch=source.launch._replace(lanes=1)).for_compiler()
-        text = f"#define erfinvf(x) ((float (*)(float)){address}ull)(x)\n{text}"
         done = subprocess.run([COMPILER, *options, "-o", library], input=text, text=True)
         assert done.returncode == 0
         return ctypes.cast(ctypes.CDLL(library)[ENTRY], ctypes.c_void_p).value
@@ -112,7 +113,7 @@ def run_threads(address, threads, arrays):
     kernel = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * len(pointers))(address)
 
     def run(number):
-        _THREAD.number = number
+        _THREAD.number, _THREAD.threads = number, threads
         kernel(*pointers)
 
     with ThreadPoolExecutor(threads) as pool:
@@ -127,16 +128,11 @@ def emulate(monkeypatch, threads=1, block=None):
         assert capability == "9.0"
         assert folder is None or folder.name == "native"
         written = write()
-        launch = written.launch
-        if written.language == "cuda":
-            # The scratch of a team is that of its one lane.
-            launch = launch._replace(scratch=launch.scratch * launch.lanes)
-            address = compiled_team(written)
-            return ptx.Kernel(source, "cuda", str(address), launch, compiled=True)
-        code = compiled(written.text, block)
-        return ptx.Kernel(
-            code.key, "ptx", str(code.addresses[ENTRY]), Launch(256, 1), compiled=True
-        )
+        # The scratch of a team is that of its one lane.
+        scratch = written.launch.scratch * written.launch.lanes
+        address = compiled(written, block)
+        launch = written.launch._replace(scratch=scratch)
+        return cubin.Kernel(source, str(address), launch, compiled=True)
 
     def call(kernel, grid, given, first, results):
         size = 32 * -(-threads // 32)
@@ -155,15 +151,15 @@ def emulate(monkeypatch, threads=1, block=None):
     monkeypatch.setattr(seam, "kernels_unavailable", lambda: None)
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
     monkeypatch.setattr(seam, "_sized", lambda kernel, items: (kernel, (1, threads)))
-    monkeypatch.setattr(ptx, "load_kernel", load)
+    monkeypatch.setattr(cubin, "load_kernel", load)
     monkeypatch.setattr(seam, "_call", call)
 
 
-def lowered(monkeypatch, function, *args, assemblers=()):
+def lowered(monkeypatch, function, *args, fills=False):
     """Returns what XLA's compiler for NVIDIA GPUs gets, as text."""
     monkeypatch.setattr(available, "platform", lambda: "gpu")
-    monkeypatch.setattr(seam, "_assemblers", lambda: (assemblers, None))
-    if not assemblers:
+    monkeypatch.setattr(seam, "_why_not_compiled", lambda: None)
+    if not fills:
         monkeypatch.setattr(seam, "_handler", lambda kernel: seam._target(kernel.key))
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
     monkeypatch.setattr(seam, "_grid", lambda items, most, blocks: (-(-items // 32), 32))

@@ -22,7 +22,7 @@ from mjx_reinforce.console import jax_setup
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.engine import cache, objects
 from mjx_reinforce.engine.cpu import machine, seam
-from mjx_reinforce.engine.gpu import ptx
+from mjx_reinforce.engine.gpu import cubin
 from mjx_reinforce.engine.gpu import seam as gpu
 from mjx_reinforce.engine.gpu.source import Launch
 from mjx_reinforce.runs import compile_times
@@ -129,10 +129,9 @@ def test_programs_depend_on_what_jax_is_told(monkeypatch):
 
 
 def test_a_program_that_launches_a_gpus_kernel_is_kept(monkeypatch):
-    kernel = ptx.Kernel("0" * 64, "ptx", "", Launch(threads=1, blocks=1), compiled=True)
-    monkeypatch.setattr(ptx, "_CACHE", {kernel.key: kernel})
+    kernel = cubin.Kernel("0" * 64, "", Launch(threads=1, blocks=1), compiled=True)
+    monkeypatch.setattr(cubin, "_CACHE", {kernel.key: kernel})
     monkeypatch.setattr(gpu, "_handler", lambda kernel: gpu._target(kernel.key))
-    monkeypatch.setattr(gpu, "_assemblers", lambda: ((), None))
 
     def add(x):
         return gpu._call(kernel, (1, 1), [jnp.ones(1, jnp.int32)], [x], [x])

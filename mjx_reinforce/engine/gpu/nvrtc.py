@@ -8,8 +8,12 @@ from pathlib import Path
 
 #: Where pip puts it, in the folder nvidia: for CUDA 13, and for CUDA 12.
 _GLOBS = ("cu*/lib/libnvrtc.so.??", "cuda_nvrtc/lib/libnvrtc.so.??")
-#: Division and roots as XLA's GPU programs have them, and denormals are zero.
-_OPTIONS = ("--std=c++17", "-default-device", "-ftz=true", "-prec-div=false", "-prec-sqrt=false")
+#: Division and roots as XLA's GPU programs have them, denormals are zero, and registers are logged.
+_OPTIONS = (
+    *("--std=c++17", "-default-device", "-ftz=true", "-prec-div=false", "-prec-sqrt=false"),
+    "--ptxas-options=-v",
+)
+_REMEDY = "pip install --upgrade nvidia-cuda-nvrtc-cu12"
 
 
 @functools.cache
@@ -28,31 +32,53 @@ def library() -> ctypes.CDLL | None:
     return None
 
 
-def version() -> str:
-    """Returns the version of NVRTC, or why there is none."""
+def why_not(capability: str) -> str | None:
+    """Returns why NVRTC compiles nothing for a compute capability, such as "9.0", or None."""
     if (nvrtc := library()) is None:
-        return "NVRTC is not found; pip install nvidia-cuda-nvrtc-cu12"
+        return f"NVRTC, NVIDIA's compiler, is not found; {_REMEDY}"
+    count = ctypes.c_int()
+    nvrtc.nvrtcGetNumSupportedArchs(ctypes.byref(count))
+    architectures = (ctypes.c_int * count.value)()
+    nvrtc.nvrtcGetSupportedArchs(architectures)
+    if int(_architecture(capability)) not in architectures:
+        return f"{version()} does not know GPUs of compute capability {capability}; {_REMEDY}"
+    return None
+
+
+def version() -> str:
+    """Returns the version of NVRTC, which is here (``why_not``)."""
+    nvrtc = _present_library()
     major = ctypes.c_int()
     minor = ctypes.c_int()
     nvrtc.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
     return f"NVRTC {major.value}.{minor.value}"
 
 
+def _present_library() -> ctypes.CDLL:
+    """Returns NVRTC; RuntimeError if it is not here."""
+    if (nvrtc := library()) is None:
+        raise RuntimeError(f"NVRTC is not found; {_REMEDY}")
+    return nvrtc
+
+
+def _architecture(capability: str) -> str:
+    """Returns NVIDIA's number of the GPUs of a compute capability, such as "90"."""
+    return capability.replace(".", "")
+
+
 def compile(capability: str, text: str) -> tuple[str, bytes]:
     """Returns NVRTC's log and the machine code of a text, for GPUs of a compute capability.
 
     Raises:
-      RuntimeError: the text is no CUDA C++, or NVRTC does not know such GPUs.
+      RuntimeError: the text is no CUDA C++, or NVRTC does not know such GPUs, or is not here.
     """
-    nvrtc = library()
-    if nvrtc is None:
-        raise RuntimeError(version())
+    nvrtc = _present_library()
     program = ctypes.c_void_p()
     no_headers = 0, None, None
     nvrtc.nvrtcCreateProgram(ctypes.byref(program), text.encode(), b"play.cu", *no_headers)
     # For one architecture by its number (sm_90, not compute_90) NVRTC makes machine code: no PTX
     # that the driver would have to assemble at the first launch.
-    options = [f"--gpu-architecture=sm_{capability.replace('.', '')}", *_OPTIONS]
+    options = [f"--gpu-architecture=sm_{_architecture(capability)}", *_OPTIONS]
     option_array = (ctypes.c_char_p * len(options))(*(x.encode() for x in options))
     status = nvrtc.nvrtcCompileProgram(program, len(options), option_array)
     log = _read(nvrtc, program, "ProgramLog").decode(errors="replace").rstrip("\0")

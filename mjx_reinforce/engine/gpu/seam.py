@@ -1,7 +1,7 @@
 """How JAX launches kernels on an NVIDIA GPU.
 
 A kernel is launched within compiled programs and loops without Python: a handler of JAX's foreign
-function interface launches machine code, which is assembled while XLA compiles.
+function interface launches machine code, which NVRTC makes while XLA compiles.
 """
 
 import ctypes
@@ -16,14 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.engine import objects
-from mjx_reinforce.engine.gpu import nvrtc, ptx
+from mjx_reinforce.engine.gpu import cubin, nvrtc
 from mjx_reinforce.engine.gpu import team_kernel as team
 from mjx_reinforce.engine.gpu.source import WARP
 
-#: LLVM 22, which llvmlite 0.48 has, is the first that bounds a kernel's threads and blocks.
-_MIN_LLVM = (22,)
-#: What may assemble a kernel, what is preferred first.
-Assemblers = tuple[ptx.Assembler, ...]
 #: XLA's names of the handlers that it knows.
 _HANDLERS: set[str] = set()
 _LOCK = threading.Lock()
@@ -31,38 +27,30 @@ _LOCK = threading.Lock()
 
 def kernels_unavailable() -> str | None:
     """Returns why kernels of ours cannot run on this GPU, None if they can."""
-    import llvmlite.binding as llvm
-
     capability = compute_capability()
     if capability.partition(".")[0] not in map(str, range(7, 100)):
         return f"it runs on NVIDIA GPUs of compute capability 7.0 or more, this is {capability!r}"
     if jax.config.values["jax_enable_x64"]:
         return "on GPUs it plays in float32 alone, and jax_enable_x64 is set"
-    if llvm.llvm_version_info < _MIN_LLVM:
-        return "its kernels need llvmlite 0.48 or newer; pip install 'llvmlite>=0.48'"
-    llvm.initialize_all_targets()
-    try:
-        llvm.Target.from_triple(ptx.TRIPLE)
-    except RuntimeError as error:
-        return f"this llvmlite has no code for GPUs: {error}"
-    return _assemblers()[1]
+    return _why_not_compiled()
 
 
 @functools.cache
-def _assemblers() -> tuple[Assemblers, str | None]:
-    """Returns what assembles kernels, what is preferred first; or why nothing does."""
+def _why_not_compiled() -> str | None:
+    """Returns why nothing compiles kernels for these GPUs and loads them, or None."""
     capabilities = {getattr(x, "compute_capability", "") for x in jax.local_devices()}
     if len(capabilities) > 1:
-        return (), f"its kernels are for GPUs of one kind, not {' and '.join(sorted(capabilities))}"
-    assemblers = ptx.assemblers(compute_capability())
-    if not assemblers:
-        return (), "NVIDIA's driver, libcuda.so.1, is not found"
-    return assemblers, None
+        return f"its kernels are for GPUs of one kind, not {' and '.join(sorted(capabilities))}"
+    try:
+        ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return "NVIDIA's driver, libcuda.so.1, is not found"
+    return nvrtc.why_not(compute_capability())
 
 
 def targets() -> list[str]:
     """Returns XLA's names of the handlers of all kernels in memory."""
-    return [_target(key) for key in ptx.in_memory()]
+    return [_target(key) for key in cubin.in_memory()]
 
 
 def restore(program: bytes) -> bool:
@@ -75,8 +63,8 @@ def restore(program: bytes) -> bool:
     # XLA writes the names of handlers into its programs as they are: no need to parse one.
     keys = set(re.findall(rb"mjx_reinforce_gpu_([0-9a-f]{64})", program))
     for key in keys:
-        kernel = ptx.kept(key.decode(), folder) if folder else None
-        if kernel is None or not _makers(kernel):
+        kernel = cubin.kept(key.decode(), folder) if folder else None
+        if kernel is None or _why_not_compiled():
             return False
         _handler(kernel)
     return True
@@ -87,24 +75,17 @@ def _target(key: str) -> str:
     return f"mjx_reinforce_gpu_{key}"
 
 
-def _makers(kernel: ptx.Kernel) -> Assemblers:
-    """Returns what makes machine code of a kernel's text, what is preferred first."""
-    if kernel.language == "cuda":
-        return (ptx.compiler(compute_capability()),)
-    return _assemblers()[0]
-
-
-def _handler(kernel: ptx.Kernel) -> str:
-    """Returns XLA's name of the handler that launches a kernel, which is assembled meanwhile."""
+def _handler(kernel: cubin.Kernel) -> str:
+    """Returns XLA's name of the handler that launches a kernel, which is compiled meanwhile."""
     name = _target(kernel.key)
     with _LOCK:
         if name not in _HANDLERS:
-            handler, slot = ptx.launcher(kernel.key)
+            handler, slot = cubin.launcher(kernel.key)
             address = jax.ffi.pycapsule(ctypes.c_void_p(handler))
             jax.ffi.register_ffi_target(name, address, platform="CUDA")
-            # A daemon, so that a program that ends early need not wait for NVIDIA's compilers.
-            arguments = (slot, kernel, _makers(kernel), objects.folder())
-            threading.Thread(target=ptx.fill, args=arguments, daemon=True).start()
+            # A daemon, so that a program that ends early need not wait for NVIDIA's compiler.
+            arguments = (slot, kernel, compute_capability(), objects.folder())
+            threading.Thread(target=cubin.fill, args=arguments, daemon=True).start()
             _HANDLERS.add(name)
     return name
 
@@ -121,12 +102,12 @@ def kernel_dependencies() -> str:
 
 
 def launch(
-    kernel: ptx.Kernel, record: Sequence[jax.ShapeDtypeStruct], horizon: int, *args: jax.Array
+    kernel: cubin.Kernel, record: Sequence[jax.ShapeDtypeStruct], horizon: int, *args: jax.Array
 ) -> Sequence[jax.Array]:
     """Runs a kernel on a GPU; vmapped, it remains one launch.
 
     Args:
-      kernel: of ``kernel.kernel_text``.
+      kernel: of ``loops.play_loop``.
       record: shape and dtype of the observation, the action and the reward of a step.
       horizon: T, the steps of an episode at most.
       args: signed limits [N], keys [N, 2], and the leaves of the actor [...] and of the state
@@ -162,11 +143,11 @@ def in_one_launch(run: Callable[..., Sequence[jax.Array]]) -> Callable[..., Sequ
 
 
 def _launch(
-    kernel: ptx.Kernel, record: Sequence[jax.ShapeDtypeStruct], horizon: int, *args: jax.Array
+    kernel: cubin.Kernel, record: Sequence[jax.ShapeDtypeStruct], horizon: int, *args: jax.Array
 ) -> Sequence[jax.Array]:
     """Runs a kernel for seeds, whose axis all arguments and results begin with."""
     seeds, episodes = args[0].shape
-    # Length, broken, simulated and the next item, in the order of ``kernel.RESULTS``.
+    # Length, broken, simulated and the next item, in the order of ``loops.RESULTS``.
     counts = (seeds, episodes), (seeds, episodes), (seeds,), (1,)
     zeros = [jnp.zeros((seeds, horizon, math.prod(x.shape), episodes), x.dtype) for x in record]
     zeros += [jnp.zeros(shape, jnp.int32) for shape in counts]
@@ -176,12 +157,12 @@ def _launch(
 
 
 def launch_map(
-    kernel: ptx.Kernel, shapes: Sequence[jax.ShapeDtypeStruct], *args: jax.Array
+    kernel: cubin.Kernel, shapes: Sequence[jax.ShapeDtypeStruct], *args: jax.Array
 ) -> Sequence[jax.Array]:
     """Runs a kernel that maps a function; vmapped, it remains one launch.
 
     Args:
-      kernel: of ``kernel.mapping_text``.
+      kernel: of ``loops.map_loop``.
       shapes: shape [N, ...] and dtype of what it returns.
       args: its arguments [N, ...].
     """
@@ -189,7 +170,7 @@ def launch_map(
     def play(*args):
         examples = len(args[0])
         sized_kernel, grid = _sized(kernel, examples)
-        sizes = jnp.array([examples, math.prod(grid)], jnp.int32)
+        sizes = jnp.array([examples], jnp.int32)
         batch_shapes = [jax.ShapeDtypeStruct((examples, *x.shape[1:]), x.dtype) for x in shapes]
         return _call(sized_kernel, grid, [sizes, *args], [], batch_shapes)
 
@@ -197,7 +178,7 @@ def launch_map(
 
 
 def _call(
-    kernel: ptx.Kernel,
+    kernel: cubin.Kernel,
     grid: tuple[int, int],
     arguments: Sequence[jax.Array],
     initial: Sequence[jax.Array],
@@ -226,7 +207,7 @@ def _call(
     return call(*arguments, *initial, blocks=blocks, threads=threads)[: len(shapes)]
 
 
-def _sized(kernel: ptx.Kernel, count: int) -> tuple[ptx.Kernel, tuple[int, int]]:
+def _sized(kernel: cubin.Kernel, count: int) -> tuple[cubin.Kernel, tuple[int, int]]:
     """Returns the kernel, and how many blocks of how many threads, that play so many items."""
     if kernel.launch.lanes > 1:
         kernel = team.for_items(kernel, count, jax.devices()[0].core_count, compute_capability())

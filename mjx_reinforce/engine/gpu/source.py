@@ -1,9 +1,7 @@
-"""What the text of a GPU's kernel is written in, and how the kernel is launched."""
+"""The text of a GPU's kernel, which is CUDA C++, and how the kernel is launched."""
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
-#: LLVM IR and CUDA C++ are written here; PTX is what LLVM makes of its own.
-Language = Literal["llvm", "ptx", "cuda"]
 #: Threads of a warp.
 WARP = 32
 
@@ -11,8 +9,8 @@ WARP = 32
 class Launch(NamedTuple):
     """How a kernel is launched.
 
-    The fields' names are keys of the first line of a kept kernel (``ptx.described``); macros of
-    CUDA C++ have their values, but for ``blocks`` (``Source.for_compiler``).
+    The fields' names are keys of the first line of a kept kernel (``cubin.described``); macros of
+    its text have their values, but for ``blocks`` (``Source.for_compiler``).
 
     threads: of a block, at most
     blocks: on a multiprocessor; its registers are as many as that leaves each thread
@@ -31,16 +29,13 @@ class Launch(NamedTuple):
 
 
 class Source(NamedTuple):
-    """A kernel as it is written. Its entry is ``kernel.ENTRY``."""
+    """A kernel as it is written. Its entry is ``loops.ENTRY``."""
 
-    language: Language
     text: str
     launch: Launch
 
     def for_compiler(self) -> str:
-        """Returns the text as its compiler reads it: CUDA C++ reads the launch as macros."""
-        if self.language != "cuda":
-            return self.text
+        """Returns the text as its compiler reads it, with the launch as macros."""
         launch = self.launch
         return (
             f"// teams of {launch.lanes}, {launch.threads} threads, {launch.shared} bytes, "

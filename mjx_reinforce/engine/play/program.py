@@ -15,8 +15,7 @@ from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, observatio
 from mjx_reinforce.engine.checks import explain
 from mjx_reinforce.engine.cpu import handler, kernel, machine
 from mjx_reinforce.engine.cpu import seam as cpu_seam
-from mjx_reinforce.engine.gpu import kernel as gpu_kernel
-from mjx_reinforce.engine.gpu import ptx, team_kernel
+from mjx_reinforce.engine.gpu import cubin, team_kernel, thread_kernel
 from mjx_reinforce.engine.gpu import seam as gpu_seam
 from mjx_reinforce.engine.gpu.source import Source
 from mjx_reinforce.engine.play import available, c_mujoco
@@ -127,7 +126,7 @@ class NativeProgram(NamedTuple):
     record: shape and dtype of the observation, the action and the reward of a step
     """
 
-    code: machine.Code | ptx.Kernel
+    code: machine.Code | cubin.Kernel
     record: list[jax.ShapeDtypeStruct]
 
 
@@ -166,7 +165,7 @@ def build_program(
 
     writers = Writers(
         write_cpu,
-        functools.partial(gpu_kernel.kernel_text, num_actor=num_actor),
+        functools.partial(thread_kernel.player_text, num_actor=num_actor),
         functools.partial(team_kernel.player_text, num_actor=num_actor),
     )
     code, shapes = load("play", env, function, examples, writers, name_of(env))
@@ -177,7 +176,7 @@ class Writers(NamedTuple):
     """What writes a kernel around a function that is written out.
 
     cpu: what is written out, and for which machine -> LLVM IR
-    gpu: what is written out -> LLVM IR, for a thread an episode
+    gpu: what is written out -> CUDA C++, for a thread an episode
     team: what is written out, and with which physics -> CUDA C++, for several lanes an episode
     """
 
@@ -193,7 +192,7 @@ def load(
     examples: Sequence[PyTree],
     writers: Writers,
     name: str,
-) -> tuple[machine.Code | ptx.Kernel, Any]:
+) -> tuple[machine.Code | cubin.Kernel, Any]:
     """Returns the machine code of a function, compiled unless memory or disk has it, and shapes.
 
     They are those of what the function returns.
@@ -213,7 +212,7 @@ def load(
     target = machine.this_machine() if available.platform() == "cpu" else None
     unrolled = SCANS
     if target is None:
-        team_kernel_and_shapes = _by_teams(job, env, function, examples, writers)
+        team_kernel_and_shapes = _by_teams(job, env, function, examples, writers, name)
         if team_kernel_and_shapes is not None:
             return team_kernel_and_shapes
         if env is not None and c_mujoco.why_best(env) is not None:
@@ -222,32 +221,35 @@ def load(
     program, shapes = scalarized.trace(function, *examples, unrolled=unrolled)
     source = f"{job} {jaxprs.fingerprint(program)} {objects.source_digest(*_WRITERS)}"
 
-    def write() -> tuple[scalarized.Scalarized, str]:
-        """Returns the function written out, and a line of LLVM IR that says what it is.
-
-        That takes seconds, and is done where there is no code of this source.
-        """
-        entries = 0 if env is None else observation_size(env)
-        expansion = _write_out(program, shapes, entries)
-        return expansion, f"; {name}, {sum(expansion.operations.values()):,} scalar operations\n"
+    def write() -> scalarized.Scalarized:
+        """Returns the function written out: it takes seconds, and is done where code is made."""
+        return _write_out(program, shapes, 0 if env is None else observation_size(env))
 
     if target:
 
         def write_cpu() -> str:
-            expansion, title = write()
-            return title + writers.cpu(expansion, target)
+            expansion = write()
+            return f"; {_title(name, expansion)}\n{writers.cpu(expansion, target)}"
 
         code = machine.load_module(source, write_cpu, handler.SYMBOLS, target, objects.folder())
         return code, shapes
 
     def write_gpu() -> Source:
-        expansion, title = write()
-        kernel_source = writers.gpu(expansion)
-        comment = "//" if kernel_source.language == "cuda" else ""
-        return kernel_source._replace(text=comment + title + kernel_source.text)
+        expansion = write()
+        return _titled(writers.gpu(expansion), name, expansion)
 
     capability = gpu_seam.compute_capability()
-    return ptx.load_kernel(source, write_gpu, capability, objects.folder()), shapes
+    return cubin.load_kernel(source, write_gpu, capability, objects.folder()), shapes
+
+
+def _title(name: str, expansion: scalarized.Scalarized) -> str:
+    """Returns what a kernel is, for people."""
+    return f"{name}, {sum(expansion.operations.values()):,} scalar operations"
+
+
+def _titled(source: Source, name: str, expansion: scalarized.Scalarized) -> Source:
+    """Returns a GPU's kernel whose text begins with what it is."""
+    return source._replace(text=f"// {_title(name, expansion)}\n{source.text}")
 
 
 def _write_out(program: jaxprs.Program, shapes: Any, entries: int = 0) -> scalarized.Scalarized:
@@ -263,8 +265,13 @@ def _write_out(program: jaxprs.Program, shapes: Any, entries: int = 0) -> scalar
 
 
 def _by_teams(
-    job: str, env: Any, function: Callable[..., Any], examples: Sequence[PyTree], writers: Writers
-) -> tuple[ptx.Kernel, Any] | None:
+    job: str,
+    env: Any,
+    function: Callable[..., Any],
+    examples: Sequence[PyTree],
+    writers: Writers,
+    name: str,
+) -> tuple[cubin.Kernel, Any] | None:
     """Returns what ``load`` does, for teams of lanes; None if they do not play this."""
     if team.why_not(env) is not None:
         return None
@@ -280,10 +287,11 @@ def _by_teams(
             source = f"{jaxprs.fingerprint(program)} {physics} {objects.source_digest(*_WRITERS)}"
 
             def write() -> Source:
-                return writers.team(_write_out(program, shapes), physics)
+                expansion = _write_out(program, shapes)
+                return _titled(writers.team(expansion, physics), name, expansion)
 
             capability = gpu_seam.compute_capability()
-            return ptx.load_kernel(f"{job} {source}", write, capability, objects.folder()), shapes
+            return cubin.load_kernel(f"{job} {source}", write, capability, objects.folder()), shapes
         except (scalar.UnsupportedPrimitive, scalar.TooLarge, NotImplementedError) as error:
             warnings.warn(f"a thread plays an episode, slower than lanes: {error}", stacklevel=2)
             return None
@@ -327,7 +335,7 @@ def machine_map(
     for leaf in stored_arguments + stored_results:
         if np.dtype(leaf.dtype).itemsize not in (4, 8):
             raise TypeError(f"it has numbers of {leaf.dtype}, not of 32 or 64 bits")
-    writers = Writers(_write_cpu, gpu_kernel.mapping_text, team_kernel.mapping_text)
+    writers = Writers(_write_cpu, thread_kernel.mapping_text, team_kernel.mapping_text)
     code, _ = load("map", env, flat, stored_arguments, writers, name)
 
     def map_rows(*args: PyTree) -> Any:

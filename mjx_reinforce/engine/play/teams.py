@@ -4,7 +4,6 @@ import ctypes
 from typing import Any
 
 from mjx_reinforce.engine.base import PhysicsModel
-from mjx_reinforce.engine.gpu import nvrtc
 from mjx_reinforce.engine.gpu.team_kernel import FEW_WARPS, MANY_WARPS, Physics
 
 #: Models of fewer degrees of freedom play faster by a thread an episode.
@@ -24,10 +23,7 @@ def why_not(env: Any) -> str | None:
         return f"a thread plays a model of fewer than {_LEAST_DOFS} degrees of freedom faster"
     from mjx_reinforce.engine.team import tables  # imports MuJoCo
 
-    if reason := tables.why(model.mj_model):
-        return reason
-    # Without the library its version is what to install.
-    return None if nvrtc.library() else nvrtc.version()
+    return tables.why(model.mj_model)
 
 
 def played_by(env: Any) -> str:

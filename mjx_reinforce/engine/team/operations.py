@@ -23,6 +23,8 @@ _TYPE_NAMES = {
 _OPERATIONS = "add sub mul and or xor eq ne lt le gt ge"
 _SIGNS = "+ - * & | ^ == != < <= > >="
 _INFIX_SIGNS = dict(zip(_OPERATIONS.split(), _SIGNS.split(), strict=True))
+#: The least and the greatest integer of 8 bits.
+_LIMITS = {"int8": (-128, 127), "uint8": (0, 255)}
 #: C++ type -> (suffix of its literals, the unsigned integer of its width).
 _LITERAL_FORMS = {"float": ("f", "unsigned"), "double": ("", "unsigned long long")}
 #: Functions of floats that the C library and CUDA have under these names, with an f for float32.
@@ -47,6 +49,33 @@ _DEVICE_FUNCTIONS = {
     "shift_right_logical": "right",
     "shift_right_arithmetic": "right_signed",
 }
+
+
+def _ones(dtype: np.dtype, x: str) -> str:
+    """Returns how many bits of an integer are set."""
+    return f"count({_bits_of(dtype, x)})"
+
+
+def _leading_zeros(dtype: np.dtype, x: str) -> str:
+    """Returns how many bits of an integer are above the highest one that is set."""
+    bits = _bits_of(dtype, x)
+    width = 8 * dtype.itemsize
+    # The exponent of a float says where that bit is; without the bit below it, none rounds up.
+    exponent = f"int(bits<unsigned>(float({bits} & ~({bits} >> 1))) >> 23)"
+    return f"({bits} == 0 ? {width} : {width + 126} - {exponent})"
+
+
+def _bits_of(dtype: np.dtype, x: str) -> str:
+    """Returns an integer of 8 or 32 bits as an unsigned one of 32."""
+    if dtype.itemsize > 4:
+        raise UnsupportedPrimitive("bits of integers of 64 bits are not counted")
+    return f"(unsigned)({_TYPE_NAMES[f'uint{8 * dtype.itemsize}']})({x})"
+
+
+#: (dtype, an integer) -> what is counted of its bits
+_BIT_COUNTS = {"population_count": _ones, "clz": _leading_zeros}
+#: As what a shift takes a byte.
+_SHIFTED_BYTES = {"shift_right_logical": "unsigned char", "shift_right_arithmetic": "signed char"}
 
 
 def type_of(dtype: np.dtype) -> str:
@@ -97,7 +126,12 @@ def expression(op: Op, dtype: np.dtype, arg_dtypes: list[np.dtype], args: list[s
         return _select(arg_dtypes[0], args)
     if name == "convert_element_type":
         # A cast to an integer type would cut 0.5 to 0; as a bool it is true.
-        return f"{args[0]} != 0" if is_bool else f"({type_of(dtype)})({args[0]})"
+        return f"{args[0]} != 0" if is_bool else _cast(dtype, operand_dtype, args[0])
+    if name in _BIT_COUNTS and not is_float:
+        return _BIT_COUNTS[name](operand_dtype, args[0])
+    if name in _SHIFTED_BYTES and operand_dtype.itemsize == 1:
+        # C++ shifts a byte as an int, whose higher bits are those that its type says.
+        args = [f"({_SHIFTED_BYTES[name]})({args[0]})", args[1]]
     if name == "bitcast_convert_type":
         return f"bits<{type_of(dtype)}>({args[0]})"
     if name == "not":
@@ -116,6 +150,15 @@ def expression(op: Op, dtype: np.dtype, arg_dtypes: list[np.dtype], args: list[s
         return f"{_DEVICE_FUNCTIONS[name]}({', '.join(args)})"
     assert name in OP_TRAITS
     raise UnsupportedPrimitive(f"it has no C++ for {name!r}")
+
+
+def _cast(dtype: np.dtype, source_dtype: np.dtype, x: str) -> str:
+    """Returns a number as one of another type."""
+    if source_dtype.kind == "f" and dtype.itemsize == 1:
+        # As XLA does it: out of the range is the nearest. Of 32 bits a GPU does so itself.
+        low, high = (literal(source_dtype.type(x)) for x in _LIMITS[np.dtype(dtype).name])
+        x = f"int(smaller(larger({x}, {low}), {high}))"
+    return f"({type_of(dtype)})({x})"
 
 
 def _select(index_dtype: np.dtype, args: list[str]) -> str:

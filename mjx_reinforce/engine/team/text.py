@@ -8,16 +8,16 @@ computed by the lanes together, where they are the same formula of other numbers
 import contextlib
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from mjx_reinforce.engine.scalar import scalarized
-from mjx_reinforce.engine.scalar.backend import Backend
 from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive
 from mjx_reinforce.engine.scalar.nodes import Call, Node, Scalar, identity, is_constant, same
 from mjx_reinforce.engine.scalar.passes import liveness
 from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop, Schedule
+from mjx_reinforce.engine.team.cpp import Cpp, qualifier
 from mjx_reinforce.engine.team.formulas import Formulas, Place, sum_terms
 from mjx_reinforce.engine.team.operations import expression, literal, type_of
 
@@ -56,7 +56,7 @@ _SIMULATIONS = {
 }
 
 
-class CText(Backend[str]):
+class CText(Cpp):
     """Writes C++ into ``lines``; a value is an expression without side effects.
 
     words: how many words of 4 bytes ``scratch`` has, so far.
@@ -73,7 +73,7 @@ class CText(Backend[str]):
           inputs: the array of an argument by its number.
           steps: physics steps of a call of "physics".
         """
-        self.lines: list[str] = []
+        super().__init__()
         self.words = 0
         self.read: set[int] = set()
         self.reports: list[str] = []
@@ -91,16 +91,6 @@ class CText(Backend[str]):
         self._arrays: dict[tuple[Call, int], str] = {}
         self._written: dict[Node, Place] = {}
         self._formulas = Formulas(self._place, lambda node: node in self._written)
-        self._count = 0
-
-    def line(self, text: str) -> None:
-        """Adds a line."""
-        self.lines.append(text)
-
-    def name(self) -> str:
-        """Returns a new name."""
-        self._count += 1
-        return f"v{self._count}"
 
     def get(self, scalar: Scalar) -> str:
         """Returns a scalar of the program."""
@@ -135,10 +125,6 @@ class CText(Backend[str]):
                 self._each(run, f"{array_id}[{start} + i] = {{}};")
             start += len(run)
 
-    def constant(self, number: Any) -> str:
-        """A literal."""
-        return literal(number)
-
     def leaf(self, node: Node) -> str:
         """An input is read where it is used."""
         place = self._place(node)
@@ -162,14 +148,6 @@ class CText(Backend[str]):
             else:
                 values[node] = self.node(node, [self.value(x, values) for x in node.args])
         return super().value(scalar, values)
-
-    def node(self, node: Node, operands: list[str]) -> str:
-        """Writes one operation."""
-        assert node.op is not None
-        name = self.name()
-        formula = expression(node.op, node.dtype, [x.dtype for x in node.args], operands)
-        self.line(f"const {type_of(node.dtype)} {name} = {formula};")
-        return name
 
     def gate(self, gate: LiveGate, values: dict[Node, str]) -> Sequence[str]:
         """Writes a branch; what it leaves is in memory, which the lanes fill together."""
@@ -203,7 +181,7 @@ class CText(Backend[str]):
             self.line(f"{type_of(carry.leaf.dtype)} {name} = {init};")
             carry_names.append(name)
             local_values[carry.leaf] = name
-        rows = [self._row(element.values, values) for element in loop.elements]
+        rows = [self.row(element.values, values) for element in loop.elements]
         array_names = []
         for record in loop.records:
             array_names.append(self.name())
@@ -360,16 +338,7 @@ class CText(Backend[str]):
                 self.reports.append(name.upper())
         self.line("t.sync();")
 
-    def _row(self, row: list[Scalar], values: dict[Node, str]) -> Callable[[str], str]:
-        """Returns what an element of a loop is in the iteration of a number."""
-        if element := self._spaced(row):
-            return element
-        name = self.name()
-        entries = ", ".join(self.value(x, values) for x in row)
-        self.line(f"{_qualifier(row)} {type_of(row[0].dtype)} {name}[] = {{{entries}}};")
-        return lambda count: f"{name}[{count}]"
-
-    def _spaced(self, row: Sequence[Scalar]) -> Callable[[str], str] | None:
+    def spaced(self, row: Sequence[Scalar]) -> Callable[[str], str] | None:
         """Returns what the k-th of evenly spaced elements of one array is; None for others."""
         spacing = liveness.evenly_spaced([self._place(x) for x in row])
         if not spacing:
@@ -463,11 +432,11 @@ class CText(Backend[str]):
             value = self.value(example, self._values)
             self.lines = outer_lines
             return value
-        if element := self._spaced(column):
+        if element := self.spaced(column):
             return element("i")
         if is_constant(example):
             literals = ", ".join(map(literal, column))
-            kind = f"{_qualifier(column)} {type_of(example.dtype)}"
+            kind = f"{qualifier(column)} {type_of(example.dtype)}"
             tables.append(f"{kind} {name}[] = {{{literals}}};")
             return f"{name}[i]"
         # Scalars of one form that are in memory are in one array: the form names it.
@@ -477,15 +446,6 @@ class CText(Backend[str]):
             tables.append(f"static const int {name}[] = {{{entries}}};")
             return f"{places[0].array}[{name}[i]]"
         return None
-
-
-def _qualifier(entries: Sequence[Scalar]) -> str:
-    """Returns what a table of scalars is declared as."""
-    # A static table is in memory, once for all; another one is made of registers each time. NVRTC
-    # makes no static table of what a function returns, as ``literal`` has infinity and NaN.
-    if all(is_constant(x) and np.isfinite(x) for x in entries):
-        return "static const"
-    return "const"
 
 
 def _owners(body: Schedule) -> dict[Node, LiveGate | LiveLoop | Call]:

@@ -13,7 +13,7 @@ from toys import Drifting
 
 from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.cpu import machine
-from mjx_reinforce.engine.gpu import ptx
+from mjx_reinforce.engine.gpu import cubin
 from mjx_reinforce.engine.gpu.source import Launch, Source
 from mjx_reinforce.engine.objects import distrust
 from mjx_reinforce.engine.play import available, program
@@ -22,19 +22,15 @@ from mjx_reinforce.engine.play.choice import machine_code
 if reason := available.unavailable():
     pytest.skip(reason, allow_module_level=True)
 
-KERNEL = """; Toy, 7 scalar operations
-define ptx_kernel void @play(ptr %to) #0 {
-  store i32 1, ptr %to
-  ret void
-}
-attributes #0 = { "nvvm.maxntid"="128" "nvvm.minctasm"="2" }
+KERNEL = """// Toy, 7 scalar operations
+extern "C" __global__ void play(int* to) { *to = 1; }
 """
 
 
 @pytest.fixture(autouse=True)
 def nothing_in_memory(monkeypatch):
     monkeypatch.setattr(machine, "_CACHE", {})
-    monkeypatch.setattr(ptx, "_CACHE", {})
+    monkeypatch.setattr(cubin, "_CACHE", {})
     monkeypatch.delenv(objects.DEBUG, raising=False)
 
 
@@ -69,13 +65,13 @@ def test_code_on_disk_is_built_again_and_described(monkeypatch, tmp_path, capfd)
 
 
 def test_a_kernel_for_a_gpu(monkeypatch, tmp_path, capfd):
-    """Its assembler's log is told where it is assembled: see test_gpu_launch."""
+    """Its compiler's log is told where it is compiled: see test_gpu_launch."""
     monkeypatch.setenv(objects.DEBUG, "1")
-    source = Source("llvm", KERNEL, Launch(threads=32, blocks=16))
-    made = ptx.load_kernel("toy", lambda: source, "9.0", tmp_path)
+    source = Source(KERNEL, Launch(threads=32, blocks=16))
+    made = cubin.load_kernel("toy", lambda: source, "9.0", tmp_path)
     said = capfd.readouterr().err
-    assert said.startswith(f"kernel {made.key}: Toy, 7 scalar operations; LLVM took ")
-    assert (tmp_path / f"{made.key}.ll").read_text() == KERNEL
+    assert re.fullmatch(rf"kernel {made.key}: Toy, 7 scalar operations; \d+ bytes of C\+\+\n", said)
+    assert (tmp_path / f"{made.key}.cu").read_text() == source.for_compiler()
 
 
 @pytest.mark.cpu

@@ -14,7 +14,7 @@ from mjx_reinforce import Box
 from mjx_reinforce.engine import objects, scalar
 from mjx_reinforce.engine.base import Discrete
 from mjx_reinforce.engine.cpu import machine
-from mjx_reinforce.engine.gpu import ptx
+from mjx_reinforce.engine.gpu import cubin
 from mjx_reinforce.engine.play import available, choice, native, program, rollouts
 from mjx_reinforce.engine.scalar import scalarized, size
 from mjx_reinforce.registry import DISTRIBUTIONS, load_definition
@@ -155,7 +155,7 @@ def test_no_code_is_made_twice(tmp_path, monkeypatch):
     assert program.build_program(env, act, actor, distribution, 17).code is first.code
     assert program.build_program(env, act, actor, distribution, 19).code is not first.code
     monkeypatch.setattr(machine, "_CACHE", {})
-    monkeypatch.setattr(ptx, "_CACHE", {})
+    monkeypatch.setattr(cubin, "_CACHE", {})
     monkeypatch.setattr(program.scalarized, "build", None)
     assert not program.build_program(env, act, actor, distribution, 17).code.compiled
 

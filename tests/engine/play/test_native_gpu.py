@@ -1,8 +1,7 @@
 """The native engine's kernels for GPUs: what they play, run on this CPU, and what they are."""
 
 import re
-import shutil
-import subprocess
+import types
 
 import gpu_on_cpu
 import jax
@@ -14,15 +13,15 @@ from scenes import THREE_FEET, Scene
 from toys import Busy, Bytes, Chain, Drifting, categorical
 
 from mjx_reinforce import Box, make_vec
-from mjx_reinforce.engine import scalar
-from mjx_reinforce.engine.gpu import kernel as kernels
-from mjx_reinforce.engine.gpu import ptx, seam
+from mjx_reinforce.engine.gpu import cubin, loops, nvrtc, seam, thread_kernel, thread_text
 from mjx_reinforce.engine.physics import touching
 from mjx_reinforce.engine.play import available, native, program, rollouts
 from mjx_reinforce.engine.scalar import scalarized
 
 if reason := available.unavailable():
     pytest.skip(reason, allow_module_level=True)
+if gpu_on_cpu.COMPILER is None:
+    pytest.skip("there is no C++ compiler", allow_module_level=True)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +64,7 @@ def test_the_same_episodes_as_everywhere(env, distribution, monkeypatch):
 @pytest.mark.slow
 def test_episodes_that_are_not_active_are_not_played(busy, monkeypatch):
     """Also in step with others: a thread that never had an episode counts no steps."""
-    monkeypatch.setattr(kernels, "LONG_BODY", 0)
+    monkeypatch.setattr(thread_text, "LONG_BODY", 0)
     chosen = np.array([[0] * 5, [0, 1, 0, 0, 1], [0] * 5]).astype(bool)
     options = {"horizon": 20, "deterministic": jnp.arange(5) % 2 == 1}
     for threads in (1, 3):
@@ -90,7 +89,7 @@ def test_in_step_or_apart_an_episode_is_the_same(busy, monkeypatch):
     for long in (10**9, 4, 0):
         block = gpu_on_cpu.Block(3)
         gpu_on_cpu.emulate(monkeypatch, block=block)
-        monkeypatch.setattr(kernels, "LONG_BODY", long)
+        monkeypatch.setattr(thread_text, "LONG_BODY", long)
         got = played(native.native_rollout, *busy, horizon=30)
         assert block.apart is None
         meetings.append(block.meetings)
@@ -110,72 +109,154 @@ def test_threads_meet_where_some_have_no_room_for_their_contacts(monkeypatch):
     assert {0, 1, 2} <= {*touch.ravel().astype(int)}
     block = gpu_on_cpu.Block(3)
     gpu_on_cpu.emulate(monkeypatch, block=block)
-    monkeypatch.setattr(kernels, "LONG_BODY", 0)
+    monkeypatch.setattr(thread_text, "LONG_BODY", 0)
     assert_identical(played(native.native_rollout, env, who, **size), want)
     assert block.apart is None
 
 
-def kernel_text(env, actor, act, distribution):
+def player_text(env, actor, act, distribution):
     examples = program.step_shapes(env, actor)[:-1]
     function = program.step_function(env, act, distribution, 50)
     traced = scalarized.trace(program.while_running(function), *examples, unrolled=25)
     written = scalarized.build(*traced, program.BRANCH_COST, program.SCANS)
-    return kernels.kernel_text(written, len(jax.tree.leaves(actor)))
-
-
-def test_a_division_that_llvm_spells_otherwise_is_not_left():
-    """That of doubles is exact, as in XLA."""
-    text = "div.rn.ftz.f32 %f1, %f2, %f3;\n\tdiv.rn.f64 %d1, %d2, %d3;"
-    assert ptx._with_xla_divisions(text) == text.replace("div.rn.ftz", "div.full.ftz")
-    with pytest.raises(AssertionError, match="another name"):
-        ptx._with_xla_divisions("div.rn.f32 %f1, %f2, %f3;")
+    return thread_kernel.player_text(written, len(jax.tree.leaves(actor)))
 
 
 @pytest.mark.parametrize("long", [False, True])
-def test_ptx(busy, long, tmp_path, monkeypatch):
-    """It is one kernel that calls nothing; NVIDIA's assembler takes it, where there is one."""
+def test_a_kernel_is_written_once(busy, long, tmp_path, monkeypatch):
+    """It is one kernel, whose loops stay loops; all threads meet where it is long."""
     env, player = busy
     if long:
-        monkeypatch.setattr(kernels, "LONG_BODY", 4)
-    llvm = kernel_text(env, *player)
+        monkeypatch.setattr(thread_text, "LONG_BODY", 4)
+    source = player_text(env, *player)
 
     def on_disk():
         pytest.fail("it is on disk")
 
     for capability in ("7.5", "9.0"):
-        made = ptx.load_kernel(llvm.text, lambda: llvm, capability, tmp_path)
-        assert (made.compiled, made.language) == (True, "ptx")
-        threads, blocks = made.launch[:2]
-        assert (threads, blocks) == ((256, 1) if long else (32, 16))
-        assert f".maxntid {threads}" in made.text
-        assert f".minnctapersm {blocks}" in made.text
-        assert made.text.count(".entry play(") == 1
-        assert f".target sm_{capability.replace('.', '')}" in made.text
-        assert "call" not in made.text
-        assert '.pragma "nounroll";' in made.text  # the assembler leaves our loops as they are
-        meetings = re.findall(r"(bar.warp.sync 0xffffffff; )?bar(?:rier)?\.(?:sync|red)", made.text)
-        assert meetings
-        assert all(meetings)  # a warp comes together before each: an H200 waited forever without
-        ptx._CACHE.clear()
-        again = ptx.load_kernel(llvm.text, on_disk, capability, tmp_path)
+        made = cubin.load_kernel(source.text, lambda: source, capability, tmp_path)
+        assert made.compiled
+        assert made.source == source
+        cubin._CACHE.clear()
+        again = cubin.load_kernel(source.text, on_disk, capability, tmp_path)
         assert again == made._replace(compiled=False)
-        if shutil.which("ptxas"):
-            source = tmp_path / "play.ptx"
-            source.write_text(made.text)
-            architecture = f"-arch=sm_{capability.replace('.', '')}"
-            subprocess.run(["ptxas", "-O0", architecture, source, "-o", "/dev/null"], check=True)
+    assert made.launch[:2] == ((256, 1) if long else (32, 16))
+    body = made.text.partition('extern "C" KERNEL play(')[2]
+    assert "extern" not in body
+    loops_of_step = re.findall(r"(LOOP )?(?:while|do)\b(?! \(first)(?!.*;$)", body, re.MULTILINE)
+    assert loops_of_step
+    assert all(loops_of_step)  # NVIDIA's compiler leaves our loops as they are
+    places = re.findall(r"t\.(?:meet|gather)\(", body)
+    assert len(places) > 1 if long else places == ["t.meet("]
+    barriers = re.findall(r'(bar\.warp\.sync 0xffffffff;[\s"]*)?bar\.(?:sync|red)', made.text)
+    assert len(barriers) == 2
+    assert all(barriers)  # a warp comes together before each: an H200 waited forever without
 
 
-def test_a_gpu_that_llvm_does_not_know_is_refused():
-    text = "define ptx_kernel void @play() { ret void }"
-    assert ".target sm_90" in ptx._compile(text, "9.0")
-    with pytest.raises(RuntimeError, match="does not know GPUs of compute capability 99"):
-        ptx._compile(text, "99.0")
+def test_nvidias_compiler_takes_a_kernel(busy, monkeypatch):
+    """Where there is one; its log says how many registers a thread has."""
+    if nvrtc.library() is None:
+        pytest.skip("there is no NVRTC")
+    env, player = busy
+    for long, most in ((10**9, 128), (4, 255)):
+        monkeypatch.setattr(thread_text, "LONG_BODY", long)
+        log, image = nvrtc.compile("9.0", player_text(env, *player).for_compiler())
+        assert image.startswith(b"\x7fELF")
+        (registers,) = re.findall(r"Used (\d+) registers", log)
+        assert int(registers) <= most
+        assert "0 bytes spill" in log
+    with pytest.raises(RuntimeError, match="NVRTC returned"):
+        nvrtc.compile("9.0", "no C++")
+    assert "does not know GPUs of compute capability 99.0" in (nvrtc.why_not("99.0") or "")
 
 
-def test_what_no_kernel_computes_is_refused():
-    with pytest.raises(scalar.UnsupportedPrimitive, match="cosh: no kernel"):
-        ptx._compile("declare double @cosh(double)\n", "9.0")
+def library_of_two_kinds():
+    """An NVRTC of version 12.4 that knows GPUs of two kinds."""
+
+    def version(major, minor):
+        major._obj.value, minor._obj.value = 12, 4
+
+    def architectures(array):
+        array[:] = 75, 90
+
+    return types.SimpleNamespace(
+        nvrtcVersion=version,
+        nvrtcGetNumSupportedArchs=lambda count: setattr(count._obj, "value", 2),
+        nvrtcGetSupportedArchs=architectures,
+    )
+
+
+def test_it_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(nvrtc, "library", library_of_two_kinds)
+    assert (nvrtc.why_not("9.0"), nvrtc.version()) == (None, "NVRTC 12.4")
+    remedy = "pip install --upgrade nvidia-cuda-nvrtc-cu12"
+    newer = "NVRTC 12.4 does not know GPUs of compute capability 12.0"
+    assert nvrtc.why_not("12.0") == f"{newer}; {remedy}"
+    monkeypatch.setattr(nvrtc, "library", lambda: None)
+    assert nvrtc.why_not("9.0") == f"NVRTC, NVIDIA's compiler, is not found; {remedy}"
+    with pytest.raises(RuntimeError, match=remedy):
+        nvrtc.compile("9.0", "")
+
+
+def on_bits(x):
+    """Of integers of 32 and of 8 bits, whose results leave their range."""
+    small = x.astype(jnp.int8)
+    unsigned = small.astype(jnp.uint8)
+    number = jax.lax.bitcast_convert_type(x, jnp.uint32)
+    results = [jax.lax.population_count(x), jax.lax.clz(x), x * 1_103_515_245 + 12_345, x - 99]
+    results += [jax.lax.population_count(small), jax.lax.clz(unsigned), small * 3, unsigned + 200]
+    for y in (x, number, small, unsigned):
+        for by in (0, 3, 7, 8, 31, 32):
+            results += [y << by, jax.lax.shift_right_logical(y, jnp.full_like(y, by))]
+            results += [jax.lax.shift_right_arithmetic(y, jnp.full_like(y, by))]
+    return [y.astype(jnp.int32) for y in results]
+
+
+def on_floats(x):
+    """Also out of the range of 8 bits, where the nearest integer is taken."""
+    results = [jnp.cosh(x / 50), jnp.arcsinh(x), jnp.log1p(jnp.abs(x)), jax.lax.erf_inv(x / 400)]
+    results += [jnp.sign(x), jnp.round(x), jax.lax.rem(x, 7.0), jnp.cbrt(x), jnp.tanh(x)]
+    results += [x.astype(dtype).astype(jnp.float32) for dtype in (jnp.int8, jnp.uint8, jnp.int32)]
+    return results
+
+
+def test_operations_are_those_of_xla(monkeypatch):
+    gpu_on_cpu.emulate(monkeypatch, 3)
+    bits = jnp.int32([0, 1, -1, 5, 127, 128, 200, -200, 2**24 + 1, 2**31 - 1, -(2**31), 0x6DB7])
+    for got, want in zip(
+        jax.jit(program.machine_map(on_bits, bits[0]))(bits), jax.vmap(on_bits)(bits), strict=True
+    ):
+        np.testing.assert_array_equal(got, want)
+    floats = jnp.float32([0.0, -0.0, 0.5, 1.5, 2.5, -2.5, 126.7, 128.2, 255.9, 300, -129.5, -1])
+    for got, want in zip(
+        jax.jit(program.machine_map(on_floats, floats[0]))(floats),
+        jax.vmap(on_floats)(floats),
+        strict=True,
+    ):
+        np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("size", "entries"),
+    [
+        (2, {"in0[1].x[1]", "in0[4].x[1]", "in0[0 + 1 * v2].x[1]"}),
+        (4, {"in0[0].x[3]", "in0[2].x[1]", "in0->x[1 + 2 * v2]"}),
+    ],
+)
+def test_neighbors_of_a_policys_array_are_loaded_together(size, entries):
+    """In groups of as many floats as every row begins at a multiple of."""
+
+    def total(params, x):
+        pairs = params[:8].reshape(4, 2)
+        product = jax.lax.scan(lambda y, row: (y * row[1], None), x, pairs)[0]
+        return product + params[3] + params[9]
+
+    traced = scalarized.trace(total, jnp.ones(10), jnp.float32(1))
+    written = scalarized.build(*traced, program.BRANCH_COST, program.SCANS)
+    text = thread_text.ThreadText(lambda number: f"in{number}", {"in0": size})
+    text.compile(written.schedule, written.outputs)
+    places = re.findall(r"in0(?:->x)?\[[^]]*\](?:\.x\[\d\])?", "\n".join(text.lines))
+    assert set(places) == entries
 
 
 def test_one_launch_for_all_seeds_in_loops(busy, monkeypatch):
@@ -196,7 +277,7 @@ def test_one_launch_for_all_seeds_in_loops(busy, monkeypatch):
     calls = [line for line in text.splitlines() if "@mjx_reinforce_gpu_" in line]
     assert len(calls) == 1
     assert "tensor<6x50x2x8xf32>" in calls[0]
-    assert calls[0].count("operand_index") == len(kernels.RESULTS)
+    assert calls[0].count("operand_index") == len(loops.RESULTS)
     assert "blocks = 2 : i32" in calls[0]
     assert "threads = 32 : i32" in calls[0]
 
@@ -206,9 +287,6 @@ def test_it_says_why_there_are_no_kernels(monkeypatch):
     monkeypatch.setattr(seam, "compute_capability", lambda: "gfx90a")
     assert "this is 'gfx90a'" in (seam.kernels_unavailable() or "")
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
-    with monkeypatch.context() as patch:
-        patch.setattr("llvmlite.binding.llvm_version_info", (20, 1, 8))
-        assert "llvmlite>=0.48" in (seam.kernels_unavailable() or "")
     with jax.enable_x64(True):
         assert "float32 alone" in (seam.kernels_unavailable() or "")
     assert "libcuda.so.1, is not found" in (seam.kernels_unavailable() or "")

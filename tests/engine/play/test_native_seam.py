@@ -266,7 +266,7 @@ def test_it_says_why_it_is_unavailable(monkeypatch):
 
 
 def test_the_engine_is_imported_without_llvmlite():
-    names = ("objects", "cpu.machine", "cpu.handler", "cpu.seam", "gpu.ptx", "gpu.seam")
+    names = ("objects", "cpu.machine", "cpu.handler", "cpu.seam", "gpu.cubin", "gpu.seam")
     program = "".join(f"import mjx_reinforce.engine.{name}\n" for name in names)
     assert run(f"{program}print('llvmlite' in sys.modules)") == ["False"]
 

@@ -11,7 +11,7 @@ import pytest
 from players import actor_and_act, only_active, played
 
 from mjx_reinforce import envs, make_vec
-from mjx_reinforce.engine.gpu import nvrtc, ptx, team_kernel
+from mjx_reinforce.engine.gpu import cubin, team_kernel
 from mjx_reinforce.engine.play import available, choice, native, program
 from mjx_reinforce.engine.play import teams as team
 from mjx_reinforce.engine.scalar import scalarized
@@ -62,11 +62,10 @@ def teams(monkeypatch):
 
     def emulate():
         gpu_on_cpu.emulate(monkeypatch)
-        monkeypatch.setattr(nvrtc, "library", lambda: True)
         monkeypatch.setattr(team, "_LEAST_DOFS", 1)
         monkeypatch.setattr(team, "_shared_memory", lambda: 232_448)
-        load = ptx.load_kernel
-        monkeypatch.setattr(ptx, "load_kernel", lambda *x: made.append(load(*x)) or made[-1])
+        load = cubin.load_kernel
+        monkeypatch.setattr(cubin, "load_kernel", lambda *x: made.append(load(*x)) or made[-1])
         return made
 
     made = []

@@ -50,13 +50,12 @@ struct Team {
   bool meets = true;  // whether other teams come to each meeting, too
   DEV Team() {
     const int place = threadIdx.x & 31;
-    lane = W > 1 ? place % W : 0;
+    lane = place % W;
     mask = (W == 32 ? 0xffffffffu : (1u << (W & 31)) - 1) << (place - lane);
   }
   // The same team; what depends on the lane is computed anew, rather than kept on the stack.
   DEV Team anew() const {
     Team t = *this;
-    if (W == 1) return t;
     asm volatile("" : "+r"(t.lane));
     t.lane &= W - 1;
     return t;
@@ -68,23 +67,19 @@ struct Team {
     return t;
   }
   DEV bool meet(bool flag = false) const;
-  DEV void sync() const { if (W > 1) __syncwarp(mask); }
-  DEV bool any(bool flag) const { return W > 1 ? bool(__any_sync(mask, flag)) : flag; }
+  DEV void sync() const { __syncwarp(mask); }
+  DEV bool any(bool flag) const { return __any_sync(mask, flag); }
   // One bit a lane.
   DEV unsigned ballot(bool flag) const {
-    if (W == 1) return flag;
     const unsigned all = __ballot_sync(mask, flag) >> ((threadIdx.x & 31) - lane);
     return W == 32 ? all : all & ((1u << (W & 31)) - 1);
   }
   // The lanes add in different orders: lane 0's sum is everybody's, so that no loop splits a team.
   DEV real sum(real x) const {
-    if (W == 1) return x;
     UNROLL for (int o = W / 2; o; o /= 2) x += __shfl_xor_sync(mask, x, o, W);
     return __shfl_sync(mask, x, 0, W);
   }
-  template <class T> DEV T from(T x, int other) const {
-    return W > 1 ? __shfl_sync(mask, x, other, W) : x;
-  }
+  template <class T> DEV T from(T x, int other) const { return __shfl_sync(mask, x, other, W); }
 };
 DEV int count(unsigned bits) { return __popc(bits); }
 DEV real root(real x) { return sqrtf(x); }

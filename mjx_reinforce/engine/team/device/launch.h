@@ -8,19 +8,14 @@ static_assert(FAR * sizeof(Contact) <= sizeof(real) * (FAR_WORDS), "no room for 
 #ifdef __CUDACC__
 #define KERNEL __global__ void __launch_bounds__(WARPS * 32, 1)
 __device__ const Model MODEL MODEL_INIT;
-struct Shared { Model m; State s[W > 1 ? TEAMS : 1]; };
-#if W == 1
-#define OWN_STATE static_assert(sizeof(Shared) <= SHARED, "no room for the model"); State s;
-#else
-#define OWN_STATE State& s = shared.s[team];
-#endif
+struct Shared { Model m; State s[TEAMS]; };
 extern __shared__ __align__(16) char shared_bytes[];
 
 struct Player : Team {
   DEV int next(int* counter) const {
     int k = 0;
     if (lane == 0) k = atomicAdd(counter, 1);
-    return from(k, 0);
+    return __shfl_sync(mask, k, 0, W);
   }
   DEV bool some(bool flag) const { return __any_sync(0xffffffffu, flag); }  // of the warp
   // Goes to so many meetings, for a warp that has nothing to play.
@@ -38,7 +33,7 @@ struct Player : Team {
   const int team = threadIdx.x / W;                                                         \
   if (team >= TEAMS) return;                                                                \
   const Model& M = shared.m;                                                                \
-  OWN_STATE                                                                                 \
+  State& s = shared.s[team];                                                                \
   const Player t;                                                                           \
   const int lane = t.lane;                                                                  \
   scratch += size_t(blockIdx.x * (blockDim.x / W) + team) * (THREAD_WORDS * W);               \
