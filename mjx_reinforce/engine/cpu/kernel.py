@@ -419,9 +419,7 @@ class _Map(handler.JobText):
         text = self.text
         kind = text.type(_INT64)
         lanes = ", ".join(f"i64 {lane}" for lane in range(text.lanes))
-        # A single lane is a scalar in LLVM, not a vector of one.
-        offsets = "0" if text.lanes == 1 else f"<{lanes}>"
-        items = text.let(f"add {kind} {text.broadcast('i64', first_item)}, {offsets}")
+        items = text.let(f"add {kind} {text.broadcast('i64', first_item)}, <{lanes}>")
         count = text.broadcast("i64", num_items)
         mask = text.let(f"icmp ult {kind} {items}, {count}")
         last_lane = text.let(f"sub {kind} {count}, {text.constant(np.int64(1))}")

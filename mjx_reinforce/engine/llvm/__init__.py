@@ -1,1 +1,1 @@
-"""LLVM IR of the scalar graph: what CPUs run, and GPUs where a thread plays an episode."""
+"""LLVM IR of the scalar graph, which CPUs run."""

@@ -1,6 +1,5 @@
 """Turns the scalar graph into LLVM IR: one instruction on a lane vector for each node."""
 
-import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
@@ -21,13 +20,10 @@ class Memory(NamedTuple):
 
     pointer: where its lane vector lies; the first one of an input, which stays until the end.
     dtype: of the entries.
-    align: bytes of which the pointer is known to be a multiple; 1 leaves it to the dtype.
-      Neighbors that are known to be aligned are loaded together.
     """
 
     pointer: str
     dtype: np.dtype
-    align: int = 1
 
 
 #: An argument: lane vectors, one after the other.
@@ -44,8 +40,6 @@ class LLVM(Backend[Value]):
     OPERATIONS = OPERATIONS
     #: So many carries, or more, change in place where they can.
     MANY_CARRIES = 32
-    #: What the branch back to the start of a loop tells LLVM.
-    LOOP_HINT = ""
 
     def __init__(self, text: Text, inputs: Callable[[int], Input]):
         """Says what is written into, and where the inputs are.
@@ -77,16 +71,14 @@ class LLVM(Backend[Value]):
     def leaf(self, node: Node) -> Value:
         """An input stays in memory."""
         number, position = node.position
-        pointer, dtype, align = self._inputs(number)
-        # The alignment of the first place holds here as far as it divides the distance of the two.
-        align = math.gcd(align, dtype.itemsize * position)
-        return Memory(self._text.at(pointer, dtype, position), dtype, align)
+        pointer, dtype = self._inputs(number)
+        return Memory(self._text.at(pointer, dtype, position), dtype)
 
     def value(self, scalar: Scalar, values: dict[Node, Value]) -> str:
         """Returns a scalar's operand, loading it where it is in memory."""
         value = super().value(scalar, values)
         if isinstance(value, Memory):
-            return self._text.load(value.pointer, value.dtype, value.align)
+            return self._text.load(value.pointer, value.dtype)
         return value
 
     def node(self, node: Node, operands: list[Value]) -> Value:
@@ -109,14 +101,10 @@ class LLVM(Backend[Value]):
         self._free_places = free_places
         return scope
 
-    def some(self, mask: str) -> str:
-        """Returns an i1: whether some lane of a mask is set, for a gate or a loop."""
-        return self._text.any(mask)
-
     def gate(self, gate: LiveGate, values: dict[Node, Value]) -> Sequence[Value]:
         """Writes a branch that is taken if some lane needs it."""
         text = self._text
-        is_needed = self.some(self.value(gate.predicate, values))
+        is_needed = text.any(self.value(gate.predicate, values))
         # What the branch stores in place needs no phi: the old value stays if it is skipped.
         live_outs = [out for out in gate.outs if out.hot not in self._stored]
         # The phi takes them from the block before the branch, so they must be known there.
@@ -169,9 +157,8 @@ class LLVM(Backend[Value]):
             active = self.value(loop.carries[loop.active].leaf, leaves)
         if not has_iteration:
             body = text.label()
-            text.line(f"br i1 {self.goes_on(loop, count, active)}, label %{body}, label %{tail}")
+            text.line(f"br i1 {self._goes_on(loop, count, active)}, label %{body}, label %{tail}")
             text.start(body)
-        skip_labels = self.may_skip(active)
         for element, reader in zip(loop.elements, readers, strict=True):
             leaves[element.leaf] = reader(count)
         scope = self.inside(loop.body, values, leaves)
@@ -180,18 +167,16 @@ class LLVM(Backend[Value]):
             text.store(self.value(record.value, scope), text.at(array_name, dtype, count), dtype)
         next_values = [self.value(carry.next, scope) for carry in carries]
         types = [text.type(carry.leaf.dtype) for carry in carries]
-        if skip_labels:
-            next_values = self._joined(*skip_labels, types, phi_names, next_values)
         next_values = [text.let(f"add i64 {count}, 1"), *next_values]
         branch = f"br label %{head}"
         if has_iteration:
-            is_repeated = self.goes_on(loop, next_values[0], active)
+            is_repeated = self._goes_on(loop, next_values[0], active)
             branch = f"br i1 {is_repeated}, label %{head}, label %{tail}"
         for hole, kind, init, following in zip(
             holes, ["i64", *types], ["0", *inits], next_values, strict=True
         ):
             text.fill(hole, f"phi {kind} [{init}, %{entry_block}], [{following}, %{text.block}]")
-        text.line(branch + self.LOOP_HINT)
+        text.line(branch)
         text.start(tail)
         # A loop that is left from its head ends with what the phis there hold. What lies in memory
         # is loaded only where it is read.
@@ -241,35 +226,14 @@ class LLVM(Backend[Value]):
         self._free_places.update(places.values())
         return places
 
-    def may_skip(self, active: str | None) -> tuple[str, str] | None:
-        """Writes at the start of a loop's body a branch around it, for what does not go on.
-
-        Returns:
-          The block with the branch, and the one to come behind the body; None for no branch.
-        """
-        return None
-
-    def _joined(
-        self, entry: str, exit_label: str, types: list[str], starts: list[str], ends: list[str]
-    ) -> list[str]:
-        """Ends a body that may have been skipped; returns the carries."""
-        text = self._text
-        end = text.block
-        text.line(f"br label %{exit_label}")
-        text.start(exit_label)
-        return [
-            text.let(f"phi {kind} [{start_value}, %{entry}], [{end_value}, %{end}]")
-            for kind, start_value, end_value in zip(types, starts, ends, strict=True)
-        ]
-
-    def goes_on(self, loop: LiveLoop, count: str, active: str | None) -> str:
+    def _goes_on(self, loop: LiveLoop, count: str, active: str | None) -> str:
         """Returns an i1: whether another iteration runs."""
         text = self._text
         conditions = []
         if loop.length is not None:
             conditions.append(text.let(f"icmp slt i64 {count}, {loop.length}"))
         if active is not None:
-            conditions.append(self.some(active))
+            conditions.append(text.any(active))
         if len(conditions) == 2:
             return text.let(f"and i1 {conditions[0]}, {conditions[1]}")
         return conditions[0]
@@ -321,12 +285,10 @@ class LLVM(Backend[Value]):
 
     def _place(self, leaf: int, start: int, stride: int, dtype: np.dtype, count: str) -> Value:
         """Returns where in an argument the element of an iteration lies."""
-        pointer, _, align = self._inputs(leaf)
+        pointer, _ = self._inputs(leaf)
         step = self._text.let(f"mul i64 {count}, {stride}")
         index = self._text.let(f"add i64 {step}, {start}")
-        # Every place that the loop reads is a multiple of this.
-        align = math.gcd(align, dtype.itemsize * stride, dtype.itemsize * start)
-        return Memory(self._text.at(pointer, dtype, index), dtype, align)
+        return Memory(self._text.at(pointer, dtype, index), dtype)
 
 
 def _place_in_input(scalar: Scalar) -> tuple[int, int] | None:

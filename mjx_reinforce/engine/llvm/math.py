@@ -1,7 +1,7 @@
 """The transcendental operations of the scalar graph in LLVM IR.
 
-Those of float32 lanes are ours, but for rare ones; those of float64 lanes, which CPUs alone have,
-are the C library's: right before fast. Results of float32 below the smallest normal number are
+Those of float32 lanes are ours, but for rare ones; those of float64 lanes are the C library's:
+right before fast. Results of float32 below the smallest normal number are
 zero, as they are in XLA's threads, and an operand below it counts as zero in ``log``.
 """
 
@@ -398,9 +398,6 @@ def _library(name: str) -> Callable[..., Lanes]:
         kind = text.type(operands[0].dtype)
         arg_types = ", ".join(["double"] * len(operands))
         text.declared.add(f"declare double @{name}({arg_types})")
-        if text.lanes == 1:
-            arguments = ", ".join(f"double {x.name}" for x in operands)
-            return operands[0].named(text.let(f"call double @{name}({arguments})"))
         vector = "poison"
         for lane in range(text.lanes):
             index = f"i64 {lane}"

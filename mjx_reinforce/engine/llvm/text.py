@@ -77,7 +77,7 @@ class Hole(NamedTuple):
 class Text:
     """The body of a function as it is written; a value is the text of an operand.
 
-    lanes: how many values a lane vector holds; 1 writes scalars.
+    lanes: how many values a lane vector holds.
     declared: the intrinsics and library functions that were called, as declarations.
     block: the basic block that is being written.
     """
@@ -112,15 +112,10 @@ class Text:
 
     def type(self, dtype: DTypeLike) -> str:
         """Returns the type of a lane vector."""
-        scalar = scalar_type(dtype)
-        if self.lanes == 1:
-            return scalar
-        return f"<{self.lanes} x {scalar}>"
+        return f"<{self.lanes} x {scalar_type(dtype)}>"
 
     def constant(self, number: Any) -> str:
         """Returns a NumPy scalar as a lane vector that has it in every lane."""
-        if self.lanes == 1:
-            return literal(number)
         return f"splat ({scalar_type(np.asarray(number).dtype)} {literal(number)})"
 
     def line(self, text: str) -> None:
@@ -148,8 +143,6 @@ class Text:
     def _suffix(self, dtype: DTypeLike) -> str:
         """Returns how intrinsics' names end for lane vectors, such as "v8f32"."""
         scalar = {"float": "f32", "double": "f64"}.get(scalar_type(dtype), scalar_type(dtype))
-        if self.lanes == 1:
-            return scalar
         return f"v{self.lanes}{scalar}"
 
     def label(self) -> str:
@@ -180,8 +173,6 @@ class Text:
 
     def any(self, mask: str) -> str:
         """Returns an i1: whether some lane of a mask is set."""
-        if self.lanes == 1:
-            return mask
         kind = f"<{self.lanes} x i1>"
         name = f"@llvm.vector.reduce.or.v{self.lanes}i1"
         self.declared.add(f"declare i1 {name}({kind})")
@@ -258,8 +249,6 @@ class Text:
 
     def broadcast(self, scalar: str, value: str) -> str:
         """Returns a scalar in every lane."""
-        if self.lanes == 1:
-            return value
         kind = f"<{self.lanes} x {scalar}>"
         first_lane = self.let(f"insertelement {kind} poison, {scalar} {value}, i64 0")
         zero_mask = f"<{self.lanes} x i32> zeroinitializer"
@@ -269,12 +258,9 @@ class Text:
         """Returns the pointer to a lane vector of an array of them."""
         return self.let(f"getelementptr inbounds {self.type(dtype)}, ptr {pointer}, i64 {index}")
 
-    def load(self, pointer: str, dtype: DTypeLike, align: int = 1) -> str:
-        """Loads a lane vector; ``align`` as of ``emit.Memory``."""
-        load = f"load {self.type(dtype)}, ptr {pointer}"
-        if align > np.dtype(dtype).itemsize:
-            load += f", align {align}"
-        return self.let(load)
+    def load(self, pointer: str, dtype: DTypeLike) -> str:
+        """Loads a lane vector."""
+        return self.let(f"load {self.type(dtype)}, ptr {pointer}")
 
     def store(self, value: str, pointer: str, dtype: DTypeLike) -> None:
         """Stores a lane vector."""
@@ -284,8 +270,6 @@ class Text:
         """Loads for each lane the entry at its own index of an array."""
         places = self._places(base, index, dtype)
         kind = self.type(dtype)
-        if self.lanes == 1:
-            return self.let(f"load {kind}, ptr {places}")
         name = f"@llvm.masked.gather.{self._suffix(dtype)}.v{self.lanes}p0"
         pointers = f"<{self.lanes} x ptr>"
         bools = self.type(bool)
@@ -298,10 +282,6 @@ class Text:
     def scatter(self, value: str, base: str, index: str, mask: str, dtype: DTypeLike) -> None:
         """Stores each lane's value at its own index of an array, where the mask is set."""
         kind = self.type(dtype)
-        if self.lanes == 1:
-            with self.when(mask):
-                self.line(f"store {kind} {value}, ptr {self._places(base, index, dtype)}")
-            return
         places = self._places(base, index, dtype)
         align = np.dtype(dtype).itemsize
         name = f"@llvm.masked.scatter.{self._suffix(dtype)}.v{self.lanes}p0"
@@ -319,14 +299,10 @@ class Text:
 
     def mask(self, flags: str) -> str:
         """Returns a vector of bools as an integer of as many bits."""
-        if self.lanes == 1:
-            return flags
         return self.let(f"bitcast {self.type(bool)} {flags} to i{self.lanes}")
 
     def bit(self, mask: str, number: int) -> str:
         """Returns an i1: whether a bit of a mask is set."""
-        if self.lanes == 1:
-            return mask
         bit_mask = self.let(f"and i{self.lanes} {mask}, {1 << number}")
         return self.let(f"icmp ne i{self.lanes} {bit_mask}, 0")
 

@@ -79,24 +79,6 @@ def test_a_backend_walks_loops_and_gates():
         assert written.compile(backend)
 
 
-@pytest.mark.parametrize("align", [1, 8, 16])
-def test_a_load_says_how_its_place_is_aligned(align):
-    """Of arguments read one by one, and in a loop that takes every second."""
-
-    def total(x):
-        pairs = x[:4].reshape(2, 2)
-        return lax.scan(lambda sums, row: (sums * row[0], None), x[5], pairs)[0]
-
-    written = scalarized.build(*scalarized.trace(total, jnp.ones(6)), 400, 1)
-    text = Text(1)
-    backend = LLVM(text, lambda number: Input("%input", np.dtype(np.float32), align))
-    backend.compile(written.schedule, written.outputs)
-    body = text.function("void @total(ptr %input)")
-    loads = re.findall(r"load float, ptr %\w+(?:, align (\d+))?", body)
-    known = str(min(align, 8)) if align > 4 else ""  # every second float, from the first
-    assert sorted(loads) == sorted(["", known])
-
-
 def folded_and_computed(name):
     """Returns [mixes, 2] what XLA computes of constants and lanes in every order, and the fold."""
     op = Op(name, tuple(sorted(PARAMS.get(name, {}).items())))

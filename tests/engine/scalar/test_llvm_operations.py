@@ -391,7 +391,6 @@ def test_float64(name):
         ("x86_64-unknown-linux-gnu", "sapphirerapids", 16, r"\bcall"),
         ("x86_64-unknown-linux-gnu", "haswell", 8, r"\bcall"),
         ("aarch64-unknown-linux-gnu", "neoverse-n1", 4, r"\bblr?\b"),
-        ("nvptx64-nvidia-cuda", "sm_90", 1, r"\bcall"),
     ],
 )
 def test_float32_calls_no_library(triple, cpu, lanes, call):
