@@ -4,7 +4,7 @@ They are written whole or not at all, checked when read, bounded in size. They a
 nobody but this user and root may have written is read.
 
 With the variable MJX_REINFORCE_DEBUG=1, for work on the compiler, each object is made even if the
-disk has it, described on stderr, and its LLVM IR is left beside it.
+disk has it, described on stderr, and the text that it is made of is left beside it.
 """
 
 import contextlib

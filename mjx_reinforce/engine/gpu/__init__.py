@@ -1,1 +1,1 @@
-"""Kernels for NVIDIA GPUs: an episode is a thread."""
+"""Kernels for NVIDIA GPUs, in which a thread or a team of lanes plays an episode."""

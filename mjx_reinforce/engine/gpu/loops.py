@@ -1,8 +1,8 @@
 """What all kernels have in common: their arguments, and the loops that play episodes and map.
 
-What plays, a thread or a team of lanes, is a *player*. A player whose episode is over takes the
-next one, of whatever seed, so few wait for longer episodes beside theirs. What a player computes
-depends on its episode alone: results are the same for any number of players.
+What plays, a thread or a team of lanes, is a *worker*. A worker whose episode is over takes the
+next one, of whatever seed, so few wait for longer episodes beside theirs. What a worker computes
+depends on its episode alone: results are the same for any number of workers.
 """
 
 from collections.abc import Iterable, Sequence
@@ -26,7 +26,7 @@ _NUM_OTHERS = 3
 #: An episode begins with one key, of two words. The key of its noise, behind it in the step's
 #: argument, is made by the first step.
 _KEY_WORDS = 2
-#: A player without an episode has the values of the first one, so that it computes sound numbers,
+#: A worker without an episode has the values of the first one, so that it computes sound numbers,
 #: which nothing keeps, beside others that have one.
 _PLAY_LOOP = """
 extern "C" KERNEL play({parameters}) {{
@@ -119,12 +119,12 @@ class StepArguments(NamedTuple):
         return f"state{number - self.num_actor}", self.leaves[number].size
 
 
-class Player(NamedTuple):
-    """What one kind of player does its own way in ``_PLAY_LOOP``, as C++.
+class Worker(NamedTuple):
+    """What one kind of worker does its own way in ``_PLAY_LOOP``, as C++.
 
     room: what it keeps an episode in
     begin: fills that from the start of episode k
-    met: what it does once the players of its block have met
+    met: what it does once the workers of its block have met
     step: computes a step; it leaves ``alive`` and ``is_broken``
     record: writes the step's records, and carries on what the next step reads
     steps: how many steps it has simulated where an episode ends
@@ -151,7 +151,7 @@ def leaves(avals: Iterable[jax.ShapeDtypeStruct]) -> list[Leaf]:
 
 
 def play_loop(
-    program: scalarized.Scalarized, num_actor: int, player: Player, scratch: Sequence[str] = ()
+    program: scalarized.Scalarized, num_actor: int, worker: Worker, scratch: Sequence[str] = ()
 ) -> str:
     """Returns the C++ of ``play``.
 
@@ -161,13 +161,13 @@ def play_loop(
     does not read; and the results, which are zero when it starts: observation [S, T, O, N], action
     [S, T, A, N], reward [S, T, N], length [S, N] int32, broken [S, N] int32, simulated [S] int32
     and next [1] int32, the item to be fetched next. Item k is episode k % N of seed k / N.
-    Episodes are the last axis of the records: players side by side write to places side by side.
+    Episodes are the last axis of the records: workers side by side write to places side by side.
 
     Args:
       program: a step.
       num_actor: how many leaves of its arguments are the actor's.
-      player: what plays.
-      scratch: a parameter behind the results, if the player needs it.
+      worker: what plays.
+      scratch: a parameter behind the results, if the worker needs it.
     """
     arguments = step_arguments(program, num_actor)
     inputs: list[tuple[str, str]] = [*zip(("int", "int", "unsigned"), CONTROLS, strict=True)]
@@ -183,13 +183,13 @@ def play_loop(
     inputs += [(type_name, f"zero_{name}") for type_name, name in result_fields]
     return _PLAY_LOOP.format(
         parameters=_parameters(inputs, result_fields, scratch),
-        room="\n".join(player.room),
-        begin="\n".join(player.begin),
-        met=player.met,
-        step="\n".join(player.step),
-        record="\n".join(player.record),
-        steps=player.steps,
-        end=player.end,
+        room="\n".join(worker.room),
+        begin="\n".join(worker.begin),
+        met=worker.met,
+        step="\n".join(worker.step),
+        record="\n".join(worker.record),
+        steps=worker.steps,
+        end=worker.end,
     )
 
 
@@ -199,14 +199,14 @@ def map_loop(
     """Returns the C++ of ``play`` that maps a function.
 
     Its arguments are pointers to: sizes [1] int32 (examples N), the leaves [N, ...] of the
-    function's arguments that are not empty, and those of its result, likewise. A player without an
+    function's arguments that are not empty, and those of its result, likewise. A worker without an
     example computes the last one again beside the others.
 
     Args:
       program: the function.
       lines: compute its results, out0 and so on, of its arguments, in0 and so on.
-      met: what a player does once those of its block have met.
-      scratch: a parameter behind the results, if the player needs it.
+      met: what a worker does once those of its block have met.
+      scratch: a parameter behind the results, if the worker needs it.
     """
     pointers = []
     inputs = [("int", "sizes")]

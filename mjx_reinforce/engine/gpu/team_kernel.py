@@ -66,7 +66,7 @@ def player_text(program: scalarized.Scalarized, physics: Physics, num_actor: int
         for number in ready_inputs:
             text.fill(f"out{number}", next_carries.pop(number))
     pointers, initial = _carried_text(text, arguments, offsets)
-    player = loops.Player(
+    worker = loops.Worker(
         room=[
             f"  Word *own = scratch, *following = scratch + {sum(words)};",
             f"  scratch += 2 * {sum(words)};",
@@ -81,7 +81,7 @@ def player_text(program: scalarized.Scalarized, physics: Physics, num_actor: int
         ],
         steps="at",
     )
-    loop = loops.play_loop(program, num_actor, player, _SCRATCH)
+    loop = loops.play_loop(program, num_actor, worker, _SCRATCH)
     return _source(physics, text, loop, 2 * sum(words) + text.words)
 
 

@@ -49,7 +49,7 @@ def player_text(program: scalarized.Scalarized, num_actor: int) -> Source:
         for field, entries in zip(loops.RESULTS, records, strict=False)
         for i, x in enumerate(entries)
     ]
-    player = loops.Player(
+    worker = loops.Worker(
         room=[*_room(arguments), "int waited = 0;"],
         begin=_begin(arguments),
         met="waited++;",
@@ -58,7 +58,7 @@ def player_text(program: scalarized.Scalarized, num_actor: int) -> Source:
         steps="taken(waited)",
         end="  if (at != 0) t.add(simulated + item / episodes, waited);\n",
     )
-    return _source(program, loops.play_loop(program, num_actor, player))
+    return _source(program, loops.play_loop(program, num_actor, worker))
 
 
 def mapping_text(program: scalarized.Scalarized) -> Source:

@@ -1,1 +1,1 @@
-"""The engine on a GPU where lanes of a warp play an episode together; see ``device``."""
+"""C++ of the scalar graph, and MuJoCo's step for lanes of a warp that play together: ``device``."""
