@@ -8,10 +8,11 @@ from pathlib import Path
 
 #: Where pip puts it, in the folder nvidia: for CUDA 13, and for CUDA 12.
 _GLOBS = ("cu*/lib/libnvrtc.so.??", "cuda_nvrtc/lib/libnvrtc.so.??")
-#: Division and roots as XLA's GPU programs have them, denormals are zero, and registers are logged.
+#: Division and roots as XLA's GPU programs have them, and denormals are zero. The log has registers,
+#: and no warnings of what a kernel does not read.
 _OPTIONS = (
     *("--std=c++17", "-default-device", "-ftz=true", "-prec-div=false", "-prec-sqrt=false"),
-    "--ptxas-options=-v",
+    *("--ptxas-options=-v", "-w"),
 )
 _REMEDY = "pip install --upgrade nvidia-cuda-nvrtc-cu12"
 

@@ -20,8 +20,6 @@ from mjx_reinforce.engine.scalar import scalarized
 
 if reason := available.unavailable():
     pytest.skip(reason, allow_module_level=True)
-if gpu_on_cpu.COMPILER is None:
-    pytest.skip("there is no C++ compiler", allow_module_level=True)
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,6 @@ from mjx_reinforce.envs.base import MujocoEnv
 
 if reason := available.unavailable():
     pytest.skip(reason, allow_module_level=True)
-if gpu_on_cpu.COMPILER is None:
-    pytest.skip("there is no C++ compiler", allow_module_level=True)
 
 LEG = """
 <mujoco>
