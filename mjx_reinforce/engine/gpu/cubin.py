@@ -23,6 +23,11 @@ from mjx_reinforce.engine.gpu.source import Launch, Source
 _LOG = logging.getLogger(__name__)
 _CACHE: dict[str, "Kernel"] = {}
 _LOCK = threading.Lock()
+_LAUNCHER = Path(__file__).with_name("launcher.ll")
+#: CUDA's number of the attribute of a kernel: bytes of shared memory that a launch may ask for.
+_SHARED_ATTRIBUTE = 8
+#: What slots point to; a launch may read it until the process ends.
+_SLOT_VALUES: list[ctypes.Array[ctypes.c_void_p]] = []
 
 
 class Kernel(NamedTuple):
@@ -90,13 +95,6 @@ def described(key: str, content: bytes, *, compiled: bool) -> Kernel:
     """Returns a kernel from what is kept of it, whose first line says what it is."""
     line, _, text = content.decode().partition("\n")
     return Kernel(key, text, Launch(**json.loads(line)), compiled)
-
-
-_LAUNCHER = Path(__file__).with_name("launcher.ll")
-#: CUDA's number of the attribute of a kernel: bytes of shared memory that a launch may ask for.
-_SHARED_ATTRIBUTE = 8
-#: What slots point to; a launch may read it until the process ends.
-_SLOT_VALUES: list[ctypes.Array[ctypes.c_void_p]] = []
 
 
 def launcher(key: str) -> tuple[int, int]:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 #: Where pip puts it, in the folder nvidia: for CUDA 13, and for CUDA 12.
 _GLOBS = ("cu*/lib/libnvrtc.so.??", "cuda_nvrtc/lib/libnvrtc.so.??")
-#: Division and roots as XLA's GPU programs have them, and denormals are zero. The log has registers,
-#: and no warnings of what a kernel does not read.
+#: Division and roots as XLA's GPU programs have them, and denormals are zero. The log has the
+#: registers, and no warnings of what a kernel does not read.
 _OPTIONS = (
     *("--std=c++17", "-default-device", "-ftz=true", "-prec-div=false", "-prec-sqrt=false"),
     *("--ptxas-options=-v", "-w"),
