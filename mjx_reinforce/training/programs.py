@@ -272,6 +272,7 @@ class Programs(NamedTuple):
     like: the shapes of a ``RunState``
     division: among which devices the runs are divided; R are those of one device
     calls_c: whether C MuJoCo computes the physics
+    keep: (name, program) -> the program as it is kept on disk, which traces it; see ``kept``
     """
 
     begin: Callable[..., tuple[jax.Array, jax.Array]]
@@ -281,6 +282,11 @@ class Programs(NamedTuple):
     like: RunState
     division: Division = ALONE
     calls_c: bool = False
+    keep: Callable[[str, Callable[..., Any]], Callable[..., Any]] = lambda _, program: program
+
+    def kept(self, name: str) -> Callable[..., Any]:
+        """Returns a program as it is compiled: traced and written to disk now, if it is kept."""
+        return self.keep(name, getattr(self, name))
 
     @property
     def state_bytes(self) -> int:
