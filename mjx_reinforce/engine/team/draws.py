@@ -45,7 +45,7 @@ def entries(tables: Any, random: Collection[str], fields: Mapping[str, Any]) -> 
     parts: Entries = {}
     model = _Episode(tables.model, fields)
     if _OF_LINKS.intersection(random):
-        parts |= _bodies(tables, model)
+        parts |= _bodies(tables, model, random)
     if INERTIAL.intersection(random):
         parts |= _weights(tables, model)
     # Degrees of freedom inherit armature and damping of actuators, too.
@@ -75,7 +75,7 @@ class _Episode:
         return self._fields[name] if name in self._fields else getattr(self._model, name)
 
 
-def _bodies(tables: Any, model: Any) -> Entries:
+def _bodies(tables: Any, model: Any, random: Collection[str]) -> Entries:
     """Returns the inertias of bodies and links, what is compensated, and the medium's forces."""
     frames = tables.frames
     mass = model.body_mass
@@ -98,20 +98,32 @@ def _bodies(tables: Any, model: Any) -> Entries:
     # The parallel axis theorem; what the world carries counts for no link.
     arm = com - link_com[links]
     shift = (arm * arm).sum(1)[:, None] * (_ROWS == _COLUMNS) - arm[:, _ROWS] * arm[:, _COLUMNS]
-    parts = {
-        ("body_mass", 0): mass[:, None],
-        ("body_com", 0): com,
-        ("body_inertia", 0): inertia,
-        ("link_mass", 0): link_mass[:, None],
-        ("link_com", 0): link_com,
-        ("link_inertia", 0): is_of_link @ (inertia + mass[:, None] * shift),
-    }
     held = (mass * model.body_gravcomp)[:, None] * jnp.column_stack([com, jnp.ones(len(com))])
-    parts["compensated", 0] = is_of_link[np.array(tables.ints["compensated_link"], int)] @ held
     bodies = tables.fluid_bodies
-    for column, part in fluid(jnp, model, bodies).items():
-        parts["fluid_body", column] = part
-    parts["fluid_body", 0] = com[bodies]
+    has_mass, has_moment, has_center = (
+        name in random for name in ("body_mass", "body_inertia", "body_ipos")
+    )
+    # Of a link that carries one body, the center is that of the body, unless nothing is there yet.
+    is_shared = bool((is_of_link @ (1 + (tables.model.body_mass == 0)) > 1).any())
+    parts: Entries = {}
+    if has_mass:
+        parts["body_mass", 0] = mass[:, None]
+        parts["link_mass", 0] = link_mass[:, None]
+    if has_moment:
+        parts["body_inertia", 0] = inertia
+    if has_center:
+        parts["body_com", 0] = com
+        parts["fluid_body", 0] = com[bodies]
+    if has_center or (has_mass and is_shared):
+        parts["link_com", 0] = link_com
+    if has_moment or is_shared:
+        parts["link_inertia", 0] = is_of_link @ (inertia + mass[:, None] * shift)
+    if has_mass or has_center:
+        compensated = np.array(tables.ints["compensated_link"], int)
+        parts["compensated", 0] = is_of_link[compensated] @ held
+    if has_mass or has_moment:
+        columns = fluid(jnp, model, bodies)
+        parts |= {("fluid_body", column): part for column, part in columns.items()}
     return parts
 
 

@@ -163,10 +163,6 @@ def _lacking_draws(model: Any, random: Collection[str]) -> Iterable[tuple[str, A
     has_gains = {"actuator_gainprm", "actuator_biasprm"}.intersection(random)
     of_balls = of_joints & (joint_kinds == BALL)
     yield "random gains of actuators of ball joints", has_gains and of_balls.any()
-    # Of the mean inertia of the model, which mj_setConst computes anew.
-    is_scaled = stops_early(model) and flags.is_off(model, "island")
-    has_inertia = {"body_mass", "body_inertia", "body_ipos", "dof_armature"}.intersection(random)
-    yield "random inertias, few iterations of its solver and no islands", is_scaled and has_inertia
 
 
 def _lacking_contacts(model: Any) -> Iterable[tuple[str, Any]]:

@@ -74,14 +74,22 @@ _OPTIONS = {
     "elliptic cones": 'cone="elliptic" impratio="10"',
     "implicitfast": 'integrator="implicitfast"',
     "few steps": 'iterations="4" ls_iterations="8"',
+    "few steps, no islands": 'iterations="3"',
 }
+#: A newcomer's tests compile one of them.
+_MARKED = [
+    pytest.param(x, marks=[] if x == "elliptic cones" else pytest.mark.slow) for x in _OPTIONS
+]
 _LONE = '<body pos="-.5 0 .09"><freejoint/><geom type="box" size=".05 .07 .1" mass=".5"/></body>'
 
 
 def _walker(options):
-    lone = "" if options == "few steps" else _LONE
+    stops_early = options.startswith("few steps")
+    lone = "" if stops_early else _LONE
     m = _C.MjModel.from_xml_string(_WALKER.format(option=_OPTIONS[options], lone=lone))
-    if options != "few steps":
+    if options == "few steps, no islands":
+        m.opt.disableflags |= _C.mjtDisableBit.mjDSBL_ISLAND
+    if not stops_early:
         m.opt.tolerance, m.opt.ls_tolerance, m.opt.ls_iterations = 0, 1e-14, 100
     return m
 
@@ -162,9 +170,8 @@ def test_each_field_is_as_in_c(name, tmp_path):
 
 
 @needs_compiler
-@pytest.mark.slow
 @pytest.mark.parametrize("lanes", [1, 8])
-@pytest.mark.parametrize("options", _OPTIONS)
+@pytest.mark.parametrize("options", _MARKED)
 def test_episodes_that_draw_all_fields_share_a_program(options, lanes, tmp_path):
     m = _walker(options)
     play = device_code.compiled(m, tmp_path, num_near=1, lanes=lanes, random=models.RANDOM)

@@ -64,11 +64,11 @@ DEV Contact contact_of(const Model& M, const State& s, int item, const Touch& to
   make_frame(c.frame, touch);
   for (int k = 0; k < 3; k++) c.at[k] = touch.at[k] - s.pose[0].origin(k);
   const int kind = M.item_kind[item];
-  c.item = item;
-  mix_friction(M, c);
   const real distance = touch.distance - M.kind_margin[kind];
   const Softness& soft = M.soft[M.kind_soft[kind]];
   const real strength = impedance(soft, distance);
+  c.item = item;
+  mix_friction(M, c);
   c.constraint_mass = constraint_mass(strength, weight_of(M, c));
   // A pair may name a softness of the rows of friction of a cone.
   const real friction_damping =

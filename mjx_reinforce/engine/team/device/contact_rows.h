@@ -41,11 +41,11 @@ DEV void stiffness_times(const Contact& c, const real* x, real* out) {
 
 // Calls do_edge(friction, k, sign) for the edges of a contact's pyramid; k is 0 for its only row.
 template <class F> DEV void each_edge(const Model& M, const Contact& c, F do_edge) {
-  const int dim = M.kind_dim[M.item_kind[c.item]];
+  const int kind = M.item_kind[c.item], dim = M.kind_dim[kind];
   if (dim == 1) do_edge(real(0), 0, real(1));
   UNROLL for (int k = 1; k < CD; k++) {
     if (k < dim) {
-      const real friction = friction_of(M, c).along[k - 1];
+      const real friction = friction_of(M, c, kind).along[k - 1];
       do_edge(friction, k, real(1));
       do_edge(-friction, k, real(-1));
     }

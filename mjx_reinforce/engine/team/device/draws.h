@@ -5,12 +5,12 @@
 // Which geom's friction a contact has: that of higher priority; or the friction of its pair.
 enum Mix { LARGER, OF_FIRST, OF_SECOND, OF_PAIR };
 
-DEV const Friction& friction_of(const Model& M, const Contact& c) {
-  return DRAWS_FRICTION ? c[0] : M.kind_friction[M.item_kind[c.item]];
+DEV const Friction& friction_of(const Model& M, const Contact& c, int kind) {
+  return DRAWS_FRICTION ? c[0] : M.kind_friction[kind];
 }
 // The regularized friction of an elliptic cone.
-DEV real mu_of(const Model& M, const Contact& c) {
-  return DRAWS_FRICTION ? CONE_SCALE * c[0].along[0] : M.kind_mu[M.item_kind[c.item]];
+DEV real mu_of(const Model& M, const Contact& c, int kind) {
+  return DRAWS_FRICTION ? CONE_SCALE * c[0].along[0] : M.kind_mu[kind];
 }
 // Gives a contact friction of its own (mj_contactParam).
 DEV void mix_friction(const Model& M, Contact& c) {
@@ -32,7 +32,8 @@ DEV real weight_of(const Model& M, const Contact& c) {
   const Item item = M.item[c.item];
   const real weight =
       M.body_weight[M.geom_body[item.first()]] + M.body_weight[M.geom_body[item.second()]];
-  if (ELLIPTIC || M.kind_dim[M.item_kind[c.item]] == 1) return weight;
-  const real mu = friction_of(M, c).along[0], square = mu * mu;
+  const int kind = M.item_kind[c.item];
+  if (ELLIPTIC || M.kind_dim[kind] == 1) return weight;
+  const real mu = friction_of(M, c, kind).along[0], square = mu * mu;
   return 2 * CONE_SCALE * CONE_SCALE * square * (1 + square) * weight;
 }
