@@ -62,6 +62,7 @@ struct Cable {
   real length, speed, acceleration, force, drag;
 };
 
+// Before all else it has the tables that an episode draws, if any (draws.py).
 struct alignas(4 * sizeof(real)) State : Drawn {
   real qpos[padded(NQ)], qvel[padded(NV)], qacc_warmstart[padded(NV)];
   real qfrc_actuator[padded(NV)], ctrl[padded(NU)], act[1], time[1];
