@@ -24,7 +24,7 @@ from mjx_reinforce.engine.physics import mjx_internals, sensors
 from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
 from mjx_reinforce.engine.scalar import prune, whole
-from mjx_reinforce.engine.team import last_pass, supported
+from mjx_reinforce.engine.team import last_pass, supported, tables
 from mjx_reinforce.envs import derived, in_batch, models, refusals
 from mjx_reinforce.envs.outcomes import (
     check_centers,
@@ -310,7 +310,7 @@ class MujocoEnv(Env):
         constants = derived.constants(self.mj_model, episode)
         # MJX normalizes quaternions in qpos itself; MuJoCo does so when it steps.
         if self._stays_whole(episode):
-            data, _ = self._whole("start", start_data)
+            data, _ = self._whole("start", start_data, episode, constants)
         else:
             forward, _ = self._physics_of(episode, constants)
             data = physics.like(forward(start_data).replace(qpos=qpos), start_data)
@@ -339,7 +339,7 @@ class MujocoEnv(Env):
         control = check_control(name, self.control(action), action, self.mj_model.nu)
         start_data = start_data.replace(ctrl=jnp.asarray(control, start_data.ctrl.dtype))
         if self._stays_whole(before.episode):
-            data, is_sound = self._whole("physics", start_data)
+            data, is_sound = self._whole("physics", start_data, before.episode, before.constants)
         else:
             data, is_sound = self._advance(before, start_data)
             # Once an env step, as Gymnasium's ``do_simulation`` calls it after the last mj_step.
@@ -372,13 +372,24 @@ class MujocoEnv(Env):
 
     def physics_model(self) -> PhysicsModel:
         """Returns what an env step simulates, for engines that compute the physics themselves."""
-        digest = f"{self._model_digest} {self.frame_skip}"
-        return PhysicsModel(self.mj_model, self.frame_skip, digest)
+        digest = " ".join([self._model_digest, str(self.frame_skip), *self._random_fields])
+        return PhysicsModel(self.mj_model, self.frame_skip, digest, self._random_fields)
 
     @functools.cached_property
     def _model_digest(self) -> str:
         """The model's hash, computed once: with large meshes that takes long, each trace asks."""
         return models.digest(self.mj_model)
+
+    @functools.cached_property
+    def _random_fields(self) -> tuple[str, ...]:
+        """The names of the model's fields that ``randomize`` replaces."""
+        if type(self).randomize is MujocoEnv.randomize:
+            return ()
+        name = type(self).__name__
+        episode = jax.eval_shape(
+            lambda key: check_episode(name, self.randomize(key), self.mj_model), jax.random.key(0)
+        )
+        return tuple(field for field in models.RANDOM if field in episode)
 
     def _is_played_by_c(self) -> bool:
         """Returns whether neither MJX nor the device code that asks simulates this model."""
@@ -387,27 +398,50 @@ class MujocoEnv(Env):
     @functools.cached_property
     def _has_device_code(self) -> bool:
         """Whether teams of lanes simulate a model that MJX refuses, and MJX has its data."""
-        return supported.why(self.mj_model) is None and models.has_data(self.mj_model)
+        return self._is_in_device_code and models.has_data(self.mj_model)
+
+    @functools.cached_property
+    def _is_in_device_code(self) -> bool:
+        """Whether the device code has the model and the fields of it that are random."""
+        return supported.why(self.mj_model, self._random_fields) is None
 
     def _stays_whole(self, episode: dict[str, jax.Array]) -> bool:
         """Returns whether the physics is to stay one operation, which device code computes."""
-        return is_kept_whole() and not models.replaced(episode)
+        fields = models.replaced(episode)
+        if not is_kept_whole() or not fields:
+            return is_kept_whole()
+        return fields.keys() <= {*self._random_fields} and self._is_in_device_code
 
     @functools.cached_property
     def _shown(self) -> Callable[..., Any]:
-        return jax.jit(functools.partial(last_pass.completed_data, self.mj_model, self.model))
+        def completed_data(fields: dict[str, jax.Array], data: mjx.Data, touch: jax.Array) -> Any:
+            model = self.model.replace(**fields)
+            return last_pass.completed_data(self.mj_model, model, data, touch)
 
-    def _whole(self, name: str, start: mjx.Data) -> tuple[Any, jax.Array]:
+        return jax.jit(completed_data)
+
+    def _whole(
+        self,
+        name: str,
+        start: mjx.Data,
+        episode: dict[str, jax.Array],
+        constants: dict[str, jax.Array],
+    ) -> tuple[Any, jax.Array]:
         """Returns what an operation of the device code makes of a simulation; whether it is sound.
 
         Args:
           name: "physics", the steps of an env step, or "start", a forward pass.
           start: the simulation before it.
+          episode: what ``randomize`` returned.
+          constants: what MuJoCo derives from that.
         """
         paths, tree = jax.tree_util.tree_flatten_with_path(start)
         results = {jax.tree_util.keystr(path): leaf for path, leaf in paths}
         sound = jax.ShapeDtypeStruct((), bool)
         operands = [getattr(start, field) for field in ("ctrl", *models.CARRIED)]
+        fields = models.replaced(episode) | constants
+        if self._random_fields and self._is_in_device_code:
+            operands.append(tables.drawn_numbers(self.mj_model, self._random_fields, fields))
         digest = self.physics_model().digest
         touch = jnp.zeros(len(last_pass.touch_sensors(self.mj_model)), start.qpos.dtype)
         last = {"pass_qpos": start.qpos, "pass_qvel": start.qvel, "pass_qacc": start.qacc}
@@ -421,7 +455,7 @@ class MujocoEnv(Env):
 
         def complete() -> mjx.Data:
             """Computes the rest; MJX has to know the model only where the task reads of that."""
-            return self._shown(last_data, touch)
+            return self._shown(fields, last_data, touch)
 
         return last_pass.Completed(self.mj_model, data, complete), is_sound
 

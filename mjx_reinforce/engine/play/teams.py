@@ -24,7 +24,7 @@ def why_not(env: Any) -> str | None:
         return f"a thread plays a model of fewer than {_LEAST_DOFS} degrees of freedom faster"
     from mjx_reinforce.engine.team import tables  # imports MuJoCo
 
-    if reason := tables.why(model.mj_model):
+    if reason := tables.why(model.mj_model, model.random):
         return reason
     # Without the library its version is what to install.
     return None if nvrtc.library() else nvrtc.version()
@@ -58,8 +58,8 @@ def team_physics(model: PhysicsModel) -> Physics:
     # of many warps have, and as many states do not fit into shared memory.
     has_room = model.mj_model.nv < lanes
     return Physics(
-        text=tables.physics_text(model.mj_model),
-        far=tables.far_words(model.mj_model),
+        text=tables.physics_text(model.mj_model, random=model.random),
+        far=tables.far_words(model.mj_model, random=model.random),
         skip=model.frame_skip,
         lanes=lanes,
         shared=_shared_memory(),

@@ -219,6 +219,15 @@ def test_what_is_not_covered_is_named(reason):
     assert str(tables.why(m)).startswith(f"the model has {reason}")
 
 
+@pytest.mark.parametrize("reason", _MODELS["randomized"])
+def test_a_random_field_that_is_not_covered_is_named(reason):
+    parts = dict(_MODELS["randomized"][reason])
+    random = parts.pop("random")
+    m = _model(**parts)
+    assert tables.why(m) is None
+    assert str(tables.why(m, random)).startswith(f"the model has {reason}")
+
+
 def test_actuators_of_several_controls_are_named():
     m = _model(actuator='<motor joint="a"/>')
     m.actuator_ctrlnum[0] = 2  # no element of MuJoCo's XML makes one

@@ -42,7 +42,8 @@ DEV constexpr int room(int fields, int numbers) { return reports(fields) ? numbe
 // A contact's rows are those of an elliptic cone, or the edges n + mu t and n - mu t of a pyramid;
 // here they are in the basis of the normal, the tangents and, from condim 4 on, turning about these.
 constexpr int COUPLING = 2 * CD - 2 + ELLIPTIC;
-struct Contact {
+// A contact has friction of its own where episodes draw it.
+struct Contact : Some<Friction, DRAWS_FRICTION> {
   real at[3];               // from the point of reference (m)
   real frame[9];            // normal, two tangents
   real residual[CD];        // J qacc - reference
@@ -61,7 +62,8 @@ struct Cable {
   real length, speed, acceleration, force, drag;
 };
 
-struct alignas(4 * sizeof(real)) State {
+// Before all else it has the tables that an episode draws, if any (draws.py).
+struct alignas(4 * sizeof(real)) State : Drawn {
   real qpos[padded(NQ)], qvel[padded(NV)], qacc_warmstart[padded(NV)];
   real qfrc_actuator[padded(NV)], ctrl[padded(NU)], act[1], time[1];
   Quad cdof[NV][2];
