@@ -204,6 +204,7 @@ def reinforce(
     if max_kl is not None:
         check_number("max_kl", max_kl, positive=True, finite=False)
     horizon = contract.check_horizon(env, horizon)
+    contract.check_num_steps(num_episodes, horizon)
     if policy is None:
         policy = mlp_policy(size, default_distribution(action_space(env)))
     contract.check_policy(policy, env, size, likelihood=True)

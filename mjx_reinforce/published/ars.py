@@ -101,6 +101,8 @@ def ars(
     if policy is None:
         policy = _zero_policy(env)
     contract.check_policy(policy, env, base.observation_size(env))
+    horizon = contract.check_horizon(env, horizon)
+    contract.check_num_steps(2 * num_directions, horizon)
     search = _Search(
         env=env,
         policy=policy,
@@ -108,7 +110,7 @@ def ars(
         step_size=step_size,
         noise_std=noise_std,
         increment=mean_difference if increment is None else increment,
-        horizon=contract.check_horizon(env, horizon),
+        horizon=horizon,
         normalize_steps=normalize_steps,
         normalize_min_std=normalize_min_std,
         engine=choose(engine, env),
