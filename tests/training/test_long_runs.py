@@ -97,9 +97,13 @@ def test_counts_of_an_update_are_less_than_2_to_31():
     """From Python, too, where they ended in errors of JAX and XLA."""
     learner = mr.reinforce(Survive(), num_episodes=4, horizon=8, engine="vmap")
     actor = learner.init(jax.random.key(0)).actor
-    for sizes in ({"num_episodes": 10**12, "horizon": 8}, {"num_episodes": 4, "horizon": 10**12}):
+    for episodes, horizon in ((10**12, 8), (4, 10**12)):
         with pytest.raises(ValueError, match=r"must be less than 2\^31, got 1000000000000"):
-            mr.evaluate(Survive(), learner, actor, jax.random.key(1), **sizes)
+            mr.evaluate(
+                *(Survive(), learner, actor, jax.random.key(1)),
+                num_episodes=episodes,
+                horizon=horizon,
+            )
     with pytest.raises(ValueError, match=r"num_directions must be less than 2\^31"):
         mr.ars(Survive(), num_directions=2**31, horizon=8)
     with pytest.raises(ValueError, match="an update may have 4,294,967,296 env steps"):
