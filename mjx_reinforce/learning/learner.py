@@ -17,7 +17,7 @@ from jax.flatten_util import ravel_pytree
 from mjx_reinforce.engine.base import Environment, Trajectory, action_space, observation_size
 from mjx_reinforce.engine.checks import check_count, check_key, check_kind, check_number
 from mjx_reinforce.engine.contract import check_environment
-from mjx_reinforce.engine.devices import check_room
+from mjx_reinforce.engine.devices import bytes_of, check_room
 from mjx_reinforce.engine.episode import check_each, episode_keys
 from mjx_reinforce.engine.play import choice
 from mjx_reinforce.engine.play.choice import Engine, Rollout
@@ -221,8 +221,10 @@ def reinforce(
 
     # Shapes alone, so that a network that is too large is refused before it takes its memory.
     actor_shapes = jax.eval_shape(functools.partial(first_actor, policy, size), jax.random.key(0))
-    # Three times: the parameters, their gradient, and what they become.
-    check_room(3.0 * sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(actor_shapes)))
+    estimator_shapes = jax.eval_shape(lambda key: estimator.init(key, size), jax.random.key(0))
+    # Three times: the parameters, their gradient, and what they become. Twice: what an estimator
+    # has learned, and what that becomes.
+    check_room(3 * bytes_of(actor_shapes) + 2 * bytes_of(estimator_shapes))
     actor_policy = choice.ActingPolicy(
         functools.partial(act, policy), actor_shapes, policy.distribution
     )
