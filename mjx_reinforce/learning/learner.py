@@ -219,12 +219,7 @@ def reinforce(
         estimator = standardize(leave_one_out(), floor=10.0)
     contract.check_estimator(estimator, env, size, num_episodes)
 
-    # Shapes alone, so that a network that is too large is refused before it takes its memory.
-    actor_shapes = jax.eval_shape(functools.partial(first_actor, policy, size), jax.random.key(0))
-    estimator_shapes = jax.eval_shape(lambda key: estimator.init(key, size), jax.random.key(0))
-    # Three times: the parameters, their gradient, and what they become. Twice: what an estimator
-    # has learned, and what that becomes.
-    check_room(3 * bytes_of(actor_shapes) + 2 * bytes_of(estimator_shapes))
+    actor_shapes = _actor_shapes(policy, estimator, size)
     actor_policy = choice.ActingPolicy(
         functools.partial(act, policy), actor_shapes, policy.distribution
     )
@@ -263,6 +258,18 @@ class RolloutPlay:
     ) -> Any:
         """Plays for one update."""
         return self.function(state, key, active, rollout)
+
+
+def _actor_shapes(policy: Policy, estimator: Estimator, observation_size: int) -> Actor:
+    """Returns the shapes of an actor, or raises ValueError where training it has no room."""
+    # Shapes alone, so that a network that is too large is refused before it takes its memory.
+    key = jax.random.key(0)
+    actor_shapes = jax.eval_shape(functools.partial(first_actor, policy, observation_size), key)
+    estimator_shapes = jax.eval_shape(lambda key: estimator.init(key, observation_size), key)
+    # Three times: the parameters, their gradient, and what they become. Twice: what an estimator
+    # has learned, and what that becomes.
+    check_room(3 * bytes_of(actor_shapes) + 2 * bytes_of(estimator_shapes))
+    return actor_shapes
 
 
 def first_actor(policy: Policy, observation_size: int, key: jax.Array) -> Actor:
