@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 
 from mjx_reinforce.engine.base import Environment, Trajectory, plain
+from mjx_reinforce.engine.checks import check_count
 from mjx_reinforce.engine.episode import episode_keys
 from mjx_reinforce.engine.play.rollouts import episode_lengths, episode_returns
 from mjx_reinforce.learning import counts
@@ -205,6 +206,9 @@ def evaluate(
       active: [] where False nothing is played, and what is returned says nothing.
       sampled: whether the second N are played.
 
+    Raises:
+      ValueError: N or T is not from 1 to 2^31 - 1.
+
     Examples:
       >>> import jax
       >>> import mjx_reinforce as mr
@@ -215,6 +219,8 @@ def evaluate(
       >>> 1 <= metrics["eval_return"].item() <= 20
       True
     """
+    check_count("num_episodes", num_episodes)
+    check_count("horizon", horizon)
     evaluation = evaluation_episodes(key, num_episodes=num_episodes, active=active, sampled=sampled)
     trajectory = learner.engine.rollout(
         env,
