@@ -219,7 +219,7 @@ DEV int newton_as_c(const Team& t, const Model& M, State& s) {
   int steps = -1;  // the first goes to the acceleration without rows, if that costs less
   LOOP for (;; steps++) {
     const bool starts = steps < 0, damps = IMPLICIT && settled;
-    real h[ROWS_A_LANE][SIDE];
+    Rows h;
     begin_step_as_c(t, M, s, search, starts, damps);
     if (!starts) each_contact(t, s, [&](Contact& c) { push(M, c); });
     t.sync();

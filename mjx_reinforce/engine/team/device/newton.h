@@ -54,20 +54,23 @@ DEV void begin_step(const Team& t, const Model& M, State& s, Search& search, boo
     if (i < NV) flat[i * (STRIDE + 1)] = search.diagonal[r] + stiffness;
   }
 }
-DEV void load_rows(const Team& t, const State& s, real (&h)[ROWS_A_LANE][SIDE]) {
+// M's rows; beyond the lanes' first columns from below the diagonal, the only place of M.
+DEV void load_rows(const Team& t, const State& s, Rows& h) {
+  const real* flat = &s.rows[0][0].x[0];
   UNROLL for (int q = 0; q < SIDE; q += 4)
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
       const int i = t.lane + r * W;
       const Quad row = s.rows[i < SIDE ? i : 0][q / 4];
-      for (int j = 0; j < 4; j++)
-        if (q + j < SIDE) h[r][q + j] = row.x[j];
+      for (int k = 0; k < 4; k++) {
+        const int j = q + k;
+        if (j < SIDE) h[r][j] = j < (r + 1) * W ? row.x[k] : flat[j * STRIDE + i];
+      }
     }
 }
 
 // Adds what contacts and general rows push to the rows of H, and subtracts their forces from the
 // gradient.
-DEV void add_rows(const Team& t, const Model& M, State& s, real (&h)[ROWS_A_LANE][SIDE],
-                  real (&gradient)[ROWS_A_LANE]) {
+DEV void add_rows(const Team& t, const Model& M, State& s, Rows& h, real (&gradient)[ROWS_A_LANE]) {
   // Two buffers by turns: a lane that is ahead writes the next contact's entries while others still
   // read this one's, and one sync a contact is enough.
   int turn = 0;
@@ -121,8 +124,7 @@ DEV void add_rows(const Team& t, const Model& M, State& s, real (&h)[ROWS_A_LANE
 
 // Minus the gradient is the row below H, for the elimination, which so solves for it on the way.
 // One lane has that row, and each has a part of the gradient: it goes through memory.
-DEV void load_right_side(const Team& t, State& s, const Search& search,
-                         real (&h)[ROWS_A_LANE][SIDE]) {
+DEV void load_right_side(const Team& t, State& s, const Search& search, Rows& h) {
   real* right_side = &s.direction[0].x[0];
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
     const int i = t.lane + r * W;
@@ -132,6 +134,7 @@ DEV void load_right_side(const Team& t, State& s, const Search& search,
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
     if (t.lane + r * W == SIDE)
       UNROLL for (int j = 0; j < SIDE; j++) h[r][j] = right_side[j];
+  UNROLL for (int r = 0; r < ROWS_A_LANE - 1; r++) h[r][SIDE] = right_side[t.lane + r * W];
 }
 
 // How the residuals change along s.direction. Of contacts by the velocities that the direction
@@ -265,7 +268,7 @@ DEV int newton(const Team& t, const Model& M, State& s) {
     // Once it is settled, another round solves for what implicit damping adds: the same
     // elimination, so that the code of a solve, which is long, is there once.
     const bool damps = IMPLICIT && settled;
-    real h[ROWS_A_LANE][SIDE];
+    Rows h;
     begin_step(t, M, s, search, damps);
     if (!damps) each_contact(t, s, [&](Contact& c) { push(M, c); });
     t.sync();

@@ -20,6 +20,12 @@ DEV constexpr int padded(int n) { return n < 1 ? 4 : (n + 3) / 4 * 4; }
 // H has an even number of rows, a row of ones on the diagonal is added; the right side is one more.
 constexpr int SIDE = NV + NV % 2;
 constexpr int ROWS_A_LANE = (SIDE + W) / W;
+// H and, as its row SIDE, the right side: h[r] is row lane + r W. As H is symmetric, entries before
+// column r W are not used: they are those of rows before, which have the right side as column SIDE.
+typedef real Rows[ROWS_A_LANE][SIDE + (ROWS_A_LANE > 1)];
+DEV constexpr bool uses_column(int r, int j) {
+  return j >= r * W && j < SIDE + (r < ROWS_A_LANE - 1);
+}
 // Quads of a row: odd, so that lanes that read one row each meet no bank twice.
 constexpr int QUADS = ((SIDE + 4) / 4) | 1;
 constexpr int STRIDE = 4 * QUADS;
