@@ -200,8 +200,10 @@ DEV void inertia_times_direction(const Team& t, const State& s, const Search& se
       for (int k = 0; k < 4; k++) {
         const int j = 4 * q + k;
         if (j >= NV) continue;
-        const real entry = j < row ? before.x[k] : flat[j * STRIDE + row];
-        if (j != row) out[r] += entry * step.x[k];
+        // Only in columns of the lanes' own numbers does it depend on the lane which is below.
+        const bool below = j < r * W || (j < (r + 1) * W && j < row);
+        const real entry = below ? before.x[k] : flat[j * STRIDE + row];
+        if (j / W != r || j != row) out[r] += entry * step.x[k];
       }
     }
     if (i >= NV) out[r] = 0;
