@@ -7,7 +7,7 @@ DEV constexpr bool is_over(int r, int m) { return (r + 1) * W <= m + 2; }
 // Solves H p = right (MuJoCo factors H, mju_cholFactor) by elimination of two columns at a time,
 // for the rows h and, as one row more, the right side. Leaves p in p and in s.direction.
 DEV void solve(const Team& t, State& s, Rows& h, real (&p)[ROWS_A_LANE]) {
-  real* flat = &s.rows[0][0].x[0];
+  real *flat = &s.rows[0][0].x[0], *right_side = &s.direction[0].x[0];
   UNROLL for (int m = 0; m < SIDE; m += 2) {
     // Columns m and m + 1 by all lanes, in one of two buffers by turns: one sync a pair of columns.
     real *first = &s.columns[m / 2 % 2][0][0].x[0], *second = &s.columns[m / 2 % 2][1][0].x[0];
@@ -36,10 +36,11 @@ DEV void solve(const Team& t, State& s, Rows& h, real (&p)[ROWS_A_LANE]) {
       const real y = uses_column(r, m) ? h[r][m + 1] : second[row];
       w[r] = (y - ratio * x) * last;
       u[r] = x * inverse - ratio * w[r];
-      if (i > m + 1 && i <= SIDE) {
+      if (i > m + 1 && i < SIDE + (ROWS_A_LANE == 1)) {
         flat[m * STRIDE + i] = u[r];
         flat[(m + 1) * STRIDE + i] = w[r];
       }
+      if (ROWS_A_LANE > 1 && i == SIDE) right_side[m] = u[r], right_side[m + 1] = w[r];
     }
     UNROLL for (int q = (m + 2) / 4; q < (SIDE + (ROWS_A_LANE > 1) + 3) / 4; q++) {
       const Quad a = s.columns[m / 2 % 2][0][q], b = s.columns[m / 2 % 2][1][q];
@@ -51,12 +52,13 @@ DEV void solve(const Team& t, State& s, Rows& h, real (&p)[ROWS_A_LANE]) {
         }
     }
   }
-  // The multipliers are above the diagonal, and those of the right side are a column behind it:
-  // from the last rows on, each row's solution is subtracted from the rows before it.
+  // The multipliers are above the diagonal, and those of the right side are a column behind it or,
+  // where it is in no row, alone: from the last rows on, each row's solution is subtracted from the
+  // rows before it.
   t.sync();
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
     const int i = t.lane + r * W;
-    p[r] = i < SIDE ? flat[i * STRIDE + SIDE] : real(0);
+    p[r] = i >= SIDE ? real(0) : ROWS_A_LANE > 1 ? right_side[i] : flat[i * STRIDE + SIDE];
   }
   UNROLL for (int q = (SIDE - 1) / 4; q >= 0; q--) {
     Quad row[ROWS_A_LANE];

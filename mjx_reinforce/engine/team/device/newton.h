@@ -76,7 +76,7 @@ DEV void add_rows(const Team& t, const Model& M, State& s, Rows& h, real (&gradi
   int turn = 0;
   all_contacts(t, s, [&](const Contact& c) {
     if (c.stiffness[0] == 0) return;
-    Quad(*const rows)[QUADS] = s.columns[turn];
+    Quad(*const rows)[quads(SIDE + 1)] = s.columns[turn];
     turn ^= 1;
     real entries[ROWS_A_LANE][CD];
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
