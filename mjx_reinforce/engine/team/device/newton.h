@@ -68,6 +68,13 @@ DEV void load_rows(const Team& t, const State& s, Rows& h) {
     }
 }
 
+// Whether a contact may move a degree of freedom from row r W on: for all lanes alike.
+DEV bool moves_rows(const Model& M, const Contact& c, int r) {
+  const Item item = M.item[c.item];
+  const Mask first = M.link_dofs[M.geom_link[item.first()]];
+  const Mask second = M.link_dofs[M.geom_link[item.second()]];
+  return r * W < NV && (first ^ second) >> (r * W);
+}
 // Adds what contacts and general rows push to the rows of H, and subtracts their forces from the
 // gradient.
 DEV void add_rows(const Team& t, const Model& M, State& s, Rows& h, real (&gradient)[ROWS_A_LANE]) {
@@ -82,7 +89,9 @@ DEV void add_rows(const Team& t, const Model& M, State& s, Rows& h, real (&gradi
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
       const int i = t.lane + r * W;
       for (int k = 0; k < CD; k++) entries[r][k] = 0;
-      if (i < NV) {
+      if (r > 0 && !moves_rows(M, c, r)) {
+        for (int k = 0; k < CD && i < SIDE; k++) rows[k][i / 4].x[i % 4] = 0;
+      } else if (i < NV) {
         basis(M, s, c, i, entries[r]);
         for (int k = 0; k < CD; k++) {
           rows[k][i / 4].x[i % 4] = entries[r][k];
