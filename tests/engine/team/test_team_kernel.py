@@ -72,6 +72,27 @@ class RandomLeg(Leg):
         return jnp.concatenate([super().observe(data), data.episode["body_mass"]])
 
 
+class RememberingLeg(Leg):
+    """It acts late, is pushed every second step, and sees the last action and noise."""
+
+    def memory(self, rng, data):
+        return {"action": jnp.zeros(1), "noise": jax.random.normal(rng, (2,)), "step": 0}
+
+    def remember(self, rng, data, action):
+        noise = jax.random.normal(rng, (2,))
+        return {"action": action, "noise": noise, "step": data.memory["step"] + 1}
+
+    def actuate(self, before, action):
+        return before.memory["action"]
+
+    def push(self, before):
+        return jnp.where(before.memory["step"] % 2 == 1, 0.1, 0.0) * before.memory["noise"]
+
+    def observe(self, data):
+        memory = data.memory
+        return jnp.concatenate([super().observe(data), memory["action"], memory["noise"]])
+
+
 @pytest.fixture
 def teams(monkeypatch):
     """Returns what lets teams play from now on; that returns the kernels that are made."""
@@ -139,6 +160,25 @@ def test_teams_play_models_that_differ_from_episode_to_episode(teams):
     for name in ("observation", "reward"):
         pair = (getattr(x, name)[:, :20] for x in (got, want))
         np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
+
+
+@pytest.mark.slow
+def test_teams_play_episodes_that_remember(teams):
+    spec = mujoco.MjSpec.from_string(LEG)
+    env = RememberingLeg(xml_file=spec, frame_skip=2, max_episode_steps=40, reward_threshold=None)
+    player = actor_and_act(env, (5,))
+    want = played(native.native_rollout, env, player, num_seeds=2)
+    made = teams()
+    got = played(native.native_rollout, env, player, num_seeds=2)
+    assert {kernel.launch.lanes for kernel in made} == {16}
+    for name in ("observation", "reward"):
+        pair = (getattr(x, name)[:, :20] for x in (got, want))
+        np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
+    np.testing.assert_allclose(
+        want.observation[:, 1:20, :, -3], want.action[:, :19, :, 0], atol=1e-6
+    )
+    noise = want.observation[:, :20, :, -1]
+    assert len(np.unique(noise)) == noise.size  # of each seed, step and episode
 
 
 def test_a_table_with_infinity_is_not_static():
