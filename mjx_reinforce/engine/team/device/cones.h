@@ -58,7 +58,8 @@ DEV void bend_cone(const Model& M, const Contact& c, real length, Bend& sum) {
 }
 
 // Finds the force and the stiffness of a contact. The stiffness of the tangents is a diagonal and,
-// where the contact slides, c.stiffness[COUPLING] times the square of the stiffness of normal and tangents.
+// where the contact slides, c.stiffness[COUPLING] times the square of the stiffness of normal and
+// tangents.
 DEV void push_cone(const Model& M, Contact& c) {
   const int kind = M.item_kind[c.item], dim = M.kind_dim[kind];
   const real mu = mu_of(M, c, kind), normal = mu * c.residual[0];

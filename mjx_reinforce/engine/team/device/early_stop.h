@@ -1,5 +1,6 @@
 // The solver of models that allow it few steps, or few lengths of one: what C answers is where its
-// search happened to be, so that this is C's own search (mj_solNewton; in JAX physics/early_stop.py).
+// search happened to be, so that this is C's own search (mj_solNewton; in JAX
+// physics/early_stop.py).
 #pragma once
 
 // A length of a step, and there the cost above that at length 0, with its derivatives.
@@ -195,8 +196,8 @@ DEV void begin_step_as_c(const Team& t, const Model& M, State& s, Search& search
   }
 }
 
-// A search that stops early leaves a gradient, of which implicit damping takes part, and turn_free_bodies
-// in s.imbalance.
+// A search that stops early leaves a gradient, of which implicit damping takes part, and
+// turn_free_bodies in s.imbalance.
 DEV void damp_rest(const Team& t, const Model& M, State& s, Search& search) {
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
     const int i = t.lane + r * W;

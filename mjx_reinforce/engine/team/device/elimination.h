@@ -24,8 +24,8 @@ DEV void solve(const Team& t, State& s, Rows& h, real (&p)[ROWS_A_LANE]) {
         UNROLL for (int j = (c / W + 1) * W; j <= SIDE; j++)
           (c == m ? first : second)[j] = h[c / W][j];
     t.sync();
-    // Multipliers u, w of columns m and m + 1: the 2 x 2 pivot inverted, times this lane's rows. Row
-    // r of the lane is row i = lane + r W of H; i == SIDE is the right side.
+    // Multipliers u, w of columns m and m + 1: the 2 x 2 pivot inverted, times this lane's rows.
+    // Row r of the lane is row i = lane + r W of H; i == SIDE is the right side.
     const real corner = first[m + 1], inverse = 1 / first[m], ratio = corner * inverse;
     const real last = 1 / (second[m + 1] - ratio * corner);
     real u[ROWS_A_LANE], w[ROWS_A_LANE];

@@ -48,7 +48,8 @@ DEV constexpr bool reports(int fields) { return (REPORTS) & fields; }
 DEV constexpr int room(int fields, int numbers) { return reports(fields) ? numbers * NB : 1; }
 
 // A contact's rows are those of an elliptic cone, or the edges n + mu t and n - mu t of a pyramid;
-// here they are in the basis of the normal, the tangents and, from condim 4 on, turning about these.
+// here they are in the basis of the normal, the tangents and, from condim 4 on, turning about
+// these.
 constexpr int COUPLING = 2 * CD - 2 + ELLIPTIC;
 // A contact has friction of its own where episodes draw it.
 struct Contact : Some<Friction, DRAWS_FRICTION> {
