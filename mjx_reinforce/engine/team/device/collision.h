@@ -16,9 +16,7 @@ DEV Touch touch_of(const Model& M, const State& s, int item, real margin) {
   } else if (are(ROUND, BOX)) {
     touch_round_and_box(M, s, a, b, part, c);
   } else if (are(BOX, BOX)) {
-    Touch boxes = c;  // of its own: what is passed on is in memory
-    touch_boxes(M, s, a, b, part, margin, boxes);
-    c = boxes;
+    touch_boxes(M, s, a, b, part, margin, c);
   } else if (are(PLANE, CYLINDER)) {
     touch_cylinder_on_plane(M, s, a, b, part, c);
   } else if (are(ROUND, CYLINDER)) {

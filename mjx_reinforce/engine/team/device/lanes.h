@@ -2,8 +2,6 @@
 #pragma once
 #ifdef __CUDACC__
 #define DEV __device__ __forceinline__
-// A function that is called, as few lanes come there: its registers are no concern of others.
-#define RARE __device__ __noinline__
 #define UNROLL _Pragma("unroll")
 #define LOOP _Pragma("unroll 1")
 typedef float real;
@@ -12,7 +10,6 @@ typedef float real;
 #include <cstddef>
 #include <cstring>
 #define DEV inline
-#define RARE inline
 #define UNROLL
 #define LOOP
 #ifndef REAL

@@ -181,8 +181,8 @@ DEV void touch_faces(const TwoBoxes& two, int face, int part, real margin, Touch
 
 // A part is a corner of the polygon in which faces meet; all parts find the same polygon, each on a
 // lane of its own.
-RARE void touch_boxes(const Model& M, const State& s, int a, int b, int part, real margin,
-                      Touch& c) {
+DEV void touch_boxes(const Model& M, const State& s, int a, int b, int part, real margin,
+                     Touch& c) {
   const TwoBoxes two(M, s, a, b);
   real sizes = 0;
   for (int k = 0; k < 3; k++) sizes += two.size[0][k] + two.size[1][k];
