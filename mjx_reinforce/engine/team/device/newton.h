@@ -219,40 +219,6 @@ DEV void inertia_times_direction(const Team& t, const State& s, const Search& se
   }
 }
 
-// Adds M direction to search.imbalance: H direction is minus the gradient, so M direction =
-// -gradient - J' stiffness J direction, without a product with M.
-DEV void follow(const Team& t, const Model& M, State& s, Search& search, real length) {
-  UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
-    search.imbalance[r] -=
-        length *
-        (search.gradient[r] + search.bounds[r].stiffness(search.qacc[r]) * search.direction[r]);
-  all_contacts(t, s, [&](const Contact& c) {
-    if (c.stiffness[0] == 0) return;
-    real force[CD];
-    stiffness_times(c, c.change, force);
-    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
-      const int i = t.lane + r * W;
-      real moves[CD];
-      if (i < NV) {
-        basis(M, s, c, i, moves);
-        for (int k = 0; k < CD; k++) search.imbalance[r] -= length * moves[k] * force[k];
-      }
-    }
-  });
-  t.sync();
-  for (int e = 0; e < NE; e++) {
-    real stiffness;
-    general_force(M, s, e, stiffness);
-    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
-      const int i = t.lane + r * W;
-      if (i < NV)
-        search.imbalance[r] -=
-            length * stiffness * s.general_change[e] * s.general[e][i / 4].x[i % 4];
-    }
-  }
-  if (NLIMITED + NLOSS) t.sync();  // before the residuals, which say what pushes, change
-}
-
 // Moves the acceleration and the residuals along the direction.
 DEV void move_along(const Team& t, State& s, Search& search, real length) {
   const int lane = t.lane;
@@ -307,13 +273,9 @@ DEV int newton(const Team& t, const Model& M, State& s) {
       // would gain its square. A tenth of that is for what the slope does not show.
       if (ELLIPTIC && SINGLE && length == 1)
         settled |= -along * line.rest * line.rest <= M.smallest_gain / 10;
-      if (ELLIPTIC) {
-        real inertia[ROWS_A_LANE];
-        inertia_times_direction(t, s, search, inertia);
-        UNROLL for (int r = 0; r < ROWS_A_LANE; r++) search.imbalance[r] += length * inertia[r];
-      } else {
-        follow(t, M, s, search, length);
-      }
+      real inertia[ROWS_A_LANE];
+      inertia_times_direction(t, s, search, inertia);
+      UNROLL for (int r = 0; r < ROWS_A_LANE; r++) search.imbalance[r] += length * inertia[r];
     }
     move_along(t, s, search, length);
     if (settled && !IMPLICIT) break;
