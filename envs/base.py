@@ -24,19 +24,26 @@ from mjx_reinforce.engine.physics import mjx_internals, sensors
 from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
 from mjx_reinforce.engine.scalar import prune, whole
-from mjx_reinforce.engine.team import last_pass, supported
+from mjx_reinforce.engine.team import last_pass, supported, tables
 from mjx_reinforce.envs import derived, in_batch, models, refusals
 from mjx_reinforce.envs.outcomes import (
     check_centers,
     check_control,
     check_episode,
     check_outcome,
+    check_push,
     check_start,
 )
 from mjx_reinforce.envs.parts import View
 from mjx_reinforce.envs.settings import EpisodeSettings, build_settings
 from mjx_reinforce.envs.starts import MOCAP, at_rest, key_frame, start_shapes
-from mjx_reinforce.envs.state import Before, Physics
+from mjx_reinforce.envs.state import (
+    Before,
+    Physics,
+    Recollection,
+    recollect_start,
+    recollect_step,
+)
 
 #: A forward pass of C MuJoCo 4.0.
 _forward = mjx_internals.fenced(physics.forward)
@@ -185,14 +192,82 @@ class MujocoEnv(Env):
         """
         return {}
 
+    def memory(self, rng: jax.Array, data: View) -> dict[str, Any]:
+        """Draws what an episode remembers at its start; by default nothing. Consumes the key.
+
+        Args:
+          rng: one key an episode.
+          data: the simulation at the start, with ``data.episode``.
+
+        Returns:
+          Numbers and arrays by name, which change from env step to env step, such as the last
+          actions, a command, or the noise of a step. ``actuate`` and ``push`` read them as
+          ``before.memory["command"]``, ``observe`` as ``data.memory["command"]``, and ``outcome``
+          as both.
+        """
+        return {}
+
+    def remember(self, rng: jax.Array, data: View, action: jax.Array) -> dict[str, Any]:
+        """Returns what an episode remembers after an env step; by default what it did before.
+
+        This is before ``outcome`` and ``observe``, which see what it returns.
+
+        Args:
+          rng: one key an env step; consumed.
+          data: the simulation after the env step; ``data.memory`` is that of before.
+          action: [A] as the policy gave it.
+
+        Returns:
+          All that ``memory`` returns, in the same shapes.
+        """
+        return data.memory
+
+    def actuate(self, before: Before, action: jax.Array) -> jax.Array:
+        """Returns the controls [nu] of an env step; by default ``control(action)``.
+
+        For controls that depend on more than the action, such as one that comes late:
+        ``self.control(before.memory["actions"][0])``.
+
+        Args:
+          before: the simulation at the start of the env step, as in ``outcome``.
+          action: [A] as the policy gave it.
+        """
+        return self.control(action)
+
+    def push(self, before: Before) -> jax.Array:
+        """Returns the change of the velocities [nv] with which an env step begins (m/s, rad/s).
+
+        By default there is none. ``before.qvel`` is that without it.
+        """
+        return jnp.zeros(self.mj_model.nv)
+
     def observe(self, data: View) -> jax.Array:
         """Returns the observation [O]; by default qpos, then qvel."""
         return jnp.concatenate([data.qpos, data.qvel])
 
     def reset(self, rng: jax.Array) -> State:
         """Returns the start of an episode; consumes the key."""
+        memory_rng, rng = self.split_rng(rng)
         episode, start = self.draw(rng)
-        return self.set_state(**start, episode=episode)
+        return self.set_state(**start, episode=episode, rng=memory_rng)
+
+    @property
+    def has_memory(self) -> bool:
+        """Whether the task's episodes remember something."""
+        return type(self).memory is not MujocoEnv.memory
+
+    @property
+    def has_pushes(self) -> bool:
+        """Whether env steps of the task begin with other velocities than the last one left."""
+        return type(self).push is not MujocoEnv.push
+
+    def split_rng(self, rng: jax.Array) -> tuple[jax.Array | None, jax.Array]:
+        """Returns the key of an episode's memory, and that for ``draw``; consumes the key."""
+        # Starts of a task that remembers nothing are those of ``rng``.
+        if not self.has_memory:
+            return None, rng
+        memory_rng, draw_rng = jax.random.split(rng)
+        return memory_rng, draw_rng
 
     def draw(self, rng: jax.Array) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
         """Returns what ``randomize`` and ``initial`` return, checked; consumes the key.
@@ -218,6 +293,7 @@ class MujocoEnv(Env):
         qpos: jax.Array,
         qvel: jax.Array,
         episode: dict[str, jax.Array] | None = None,
+        rng: jax.Array | None = None,
         **fields: jax.Array,
     ) -> State:
         """Returns the state at given positions and velocities, as Gymnasium's ``set_state``.
@@ -226,6 +302,7 @@ class MujocoEnv(Env):
           qpos: [nq] generalized positions (m, rad).
           qvel: [nv] generalized velocities (m/s, rad/s).
           episode: what the task's ``randomize`` returns, where it has one.
+          rng: the key of the episode's memory; consumed. By default that of seed 0.
           **fields: what else ``initial`` may return, as ``ctrl`` [nu]; by default as the model has.
         """
         shapes = start_shapes(self.mj_model)
@@ -234,11 +311,11 @@ class MujocoEnv(Env):
             check_shape(field, value, shapes[field])
         # What MJX refuses, C MuJoCo plays, whoever asks.
         if self._is_played_by_c():
-            return self._in_c_mujoco.set_state(qpos, qvel, episode, **fields)
+            return self._in_c_mujoco.set_state(qpos, qvel, episode, rng, **fields)
         # Whether the physics stays whole is asked during tracing, and the jitted start may have
         # been traced where it does not.
         start = self._forward_state if is_kept_whole() else self._start
-        return start(qpos, qvel, episode or {}, fields)
+        return start(qpos, qvel, episode or {}, fields, rng)
 
     @property
     def model(self) -> mjx.Model:
@@ -304,23 +381,25 @@ class MujocoEnv(Env):
         qvel: jax.Array,
         episode: dict[str, jax.Array],
         fields: dict[str, jax.Array],
+        rng: jax.Array | None,
     ) -> State:
         """Returns the state at positions, velocities and other fields, from one forward pass."""
         start_data = models.make_data(self.mj_model).replace(qpos=qpos, qvel=qvel, **fields)
         constants = derived.constants(self.mj_model, episode)
         # MJX normalizes quaternions in qpos itself; MuJoCo does so when it steps.
         if self._stays_whole(episode):
-            data, _ = self._whole("start", start_data)
+            data, _ = self._whole("start", start_data, episode, constants)
         else:
             forward, _ = self._physics_of(episode, constants)
             data = physics.like(forward(start_data).replace(qpos=qpos), start_data)
-        state = self._physics(data, episode, constants, _mocap(fields))
         view = View(data, self.mj_model, episode)
+        recollection = recollect_start(self, rng, view)
+        state = self._physics(data, episode, constants, _mocap(fields), recollection)
         # No env step was made: the outcome says only which terms there are, each 0 so far. Wrappers
         # and loops need a state of one structure from the first step on.
         zero = jnp.zeros((), qpos.dtype)
         action = jnp.zeros(self.action_size, qpos.dtype)
-        terms = self._outcome(state, start_data, view, action)[2]
+        terms = self._outcome(self._before(state, start_data), view, action)[2]
         return State(cast(Any, state), self.observe(view), zero, zero, dict.fromkeys(terms, zero))
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -336,10 +415,14 @@ class MujocoEnv(Env):
         mocap = _mocap(before.carried)
         start_data = models.make_data(self.mj_model).replace(**_carried(before), **mocap)
         name = type(self).__name__
-        control = check_control(name, self.control(action), action, self.mj_model.nu)
+        before_view = self._before(before, start_data)
+        control = check_control(name, self.actuate(before_view, action), action, self.mj_model.nu)
         start_data = start_data.replace(ctrl=jnp.asarray(control, start_data.ctrl.dtype))
+        if self.has_pushes:
+            push = check_push(name, self.push(before_view), self.mj_model.nv)
+            start_data = start_data.replace(qvel=start_data.qvel + push)
         if self._stays_whole(before.episode):
-            data, is_sound = self._whole("physics", start_data)
+            data, is_sound = self._whole("physics", start_data, before.episode, before.constants)
         else:
             data, is_sound = self._advance(before, start_data)
             # Once an env step, as Gymnasium's ``do_simulation`` calls it after the last mj_step.
@@ -347,11 +430,14 @@ class MujocoEnv(Env):
                 model = self._model_of(before.episode, before.constants)
                 data = sensors.rne_postconstraint(model, data)
         view = View(data, self.mj_model, before.episode)
-        reward, terminated, terms = self._outcome(before, start_data, view, action)
+        recollection = recollect_step(self, before, view, action)
+        reward, terminated, terms = self._outcome(before_view, view, action)
         dtype = state.reward.dtype
         return dataclasses.replace(
             state,
-            pipeline_state=self._physics(data, before.episode, before.constants, mocap),
+            pipeline_state=self._physics(
+                data, before.episode, before.constants, mocap, recollection
+            ),
             obs=self.observe(view),
             reward=jnp.where(is_sound, jnp.asarray(reward, dtype), jnp.nan),
             done=jnp.asarray(terminated, dtype),
@@ -372,13 +458,24 @@ class MujocoEnv(Env):
 
     def physics_model(self) -> PhysicsModel:
         """Returns what an env step simulates, for engines that compute the physics themselves."""
-        digest = f"{self._model_digest} {self.frame_skip}"
-        return PhysicsModel(self.mj_model, self.frame_skip, digest)
+        digest = " ".join([self._model_digest, str(self.frame_skip), *self._random_fields])
+        return PhysicsModel(self.mj_model, self.frame_skip, digest, self._random_fields)
 
     @functools.cached_property
     def _model_digest(self) -> str:
         """The model's hash, computed once: with large meshes that takes long, each trace asks."""
         return models.digest(self.mj_model)
+
+    @functools.cached_property
+    def _random_fields(self) -> tuple[str, ...]:
+        """The names of the model's fields that ``randomize`` replaces."""
+        if type(self).randomize is MujocoEnv.randomize:
+            return ()
+        name = type(self).__name__
+        episode = jax.eval_shape(
+            lambda key: check_episode(name, self.randomize(key), self.mj_model), jax.random.key(0)
+        )
+        return tuple(field for field in models.RANDOM if field in episode)
 
     def _is_played_by_c(self) -> bool:
         """Returns whether neither MJX nor the device code that asks simulates this model."""
@@ -387,27 +484,50 @@ class MujocoEnv(Env):
     @functools.cached_property
     def _has_device_code(self) -> bool:
         """Whether teams of lanes simulate a model that MJX refuses, and MJX has its data."""
-        return supported.why(self.mj_model) is None and models.has_data(self.mj_model)
+        return self._is_in_device_code and models.has_data(self.mj_model)
+
+    @functools.cached_property
+    def _is_in_device_code(self) -> bool:
+        """Whether the device code has the model and the fields of it that are random."""
+        return supported.why(self.mj_model, self._random_fields) is None
 
     def _stays_whole(self, episode: dict[str, jax.Array]) -> bool:
         """Returns whether the physics is to stay one operation, which device code computes."""
-        return is_kept_whole() and not models.replaced(episode)
+        fields = models.replaced(episode)
+        if not is_kept_whole() or not fields:
+            return is_kept_whole()
+        return fields.keys() <= {*self._random_fields} and self._is_in_device_code
 
     @functools.cached_property
     def _shown(self) -> Callable[..., Any]:
-        return jax.jit(functools.partial(last_pass.completed_data, self.mj_model, self.model))
+        def completed_data(fields: dict[str, jax.Array], data: mjx.Data, touch: jax.Array) -> Any:
+            model = self.model.replace(**fields)
+            return last_pass.completed_data(self.mj_model, model, data, touch)
 
-    def _whole(self, name: str, start: mjx.Data) -> tuple[Any, jax.Array]:
+        return jax.jit(completed_data)
+
+    def _whole(
+        self,
+        name: str,
+        start: mjx.Data,
+        episode: dict[str, jax.Array],
+        constants: dict[str, jax.Array],
+    ) -> tuple[Any, jax.Array]:
         """Returns what an operation of the device code makes of a simulation; whether it is sound.
 
         Args:
           name: "physics", the steps of an env step, or "start", a forward pass.
           start: the simulation before it.
+          episode: what ``randomize`` returned.
+          constants: what MuJoCo derives from that.
         """
         paths, tree = jax.tree_util.tree_flatten_with_path(start)
         results = {jax.tree_util.keystr(path): leaf for path, leaf in paths}
         sound = jax.ShapeDtypeStruct((), bool)
         operands = [getattr(start, field) for field in ("ctrl", *models.CARRIED)]
+        fields = models.replaced(episode) | constants
+        if self._random_fields and self._is_in_device_code:
+            operands.append(tables.drawn_numbers(self.mj_model, self._random_fields, fields))
         digest = self.physics_model().digest
         touch = jnp.zeros(len(last_pass.touch_sensors(self.mj_model)), start.qpos.dtype)
         last = {"pass_qpos": start.qpos, "pass_qvel": start.qvel, "pass_qacc": start.qacc}
@@ -421,16 +541,19 @@ class MujocoEnv(Env):
 
         def complete() -> mjx.Data:
             """Computes the rest; MJX has to know the model only where the task reads of that."""
-            return self._shown(last_data, touch)
+            return self._shown(fields, last_data, touch)
 
         return last_pass.Completed(self.mj_model, data, complete), is_sound
 
-    def _outcome(self, state: Physics, start: mjx.Data, data: View, action: jax.Array) -> Any:
-        """Returns what ``outcome`` returns, or raises ValueError where it is no outcome."""
+    def _before(self, state: Physics, start: mjx.Data) -> Before:
+        """Returns what a task knows of the start of an env step."""
         constant = {name: getattr(start, name) for name in models.CONSTANT}
         # The state's own come last: a task may have asked to carry one of these, too.
         state_fields = constant | state.carried | _carried(state)
-        before = Before(state_fields, self.mj_model, state.episode)
+        return Before(state_fields, self.mj_model, state.episode, state.memory)
+
+    def _outcome(self, before: Before, data: View, action: jax.Array) -> Any:
+        """Returns what ``outcome`` returns, or raises ValueError where it is no outcome."""
         return check_outcome(type(self).__name__, self.outcome(before, data, action))
 
     def _physics(
@@ -439,6 +562,7 @@ class MujocoEnv(Env):
         episode: dict[str, jax.Array],
         constants: dict[str, jax.Array],
         mocap: dict[str, jax.Array],
+        recollection: Recollection,
     ) -> Physics:
         """Returns what the next env step needs to know of a simulation.
 
@@ -447,6 +571,7 @@ class MujocoEnv(Env):
           episode: what ``randomize`` returned.
           constants: what MuJoCo derives from that, see ``derived.constants``.
           mocap: the poses of mocap bodies that are not as the model has them.
+          recollection: what the episode remembers.
         """
         # ``Simulation`` has MuJoCo's names, wherever MJX keeps the fields.
         carried_fields = {name: getattr(Simulation(data), name) for name in self.carried}
@@ -455,6 +580,7 @@ class MujocoEnv(Env):
             carried=carried_fields | mocap,
             episode=episode,
             constants=constants,
+            **recollection._asdict(),
         )
 
     @property

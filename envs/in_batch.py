@@ -27,10 +27,10 @@ from mjx_reinforce.engine.contract import check_shape
 from mjx_reinforce.engine.cpu.host import HostCall, HostFunction, Spec
 from mjx_reinforce.engine.memory import gigabytes, host_memory, num_cores
 from mjx_reinforce.envs import models
-from mjx_reinforce.envs.outcomes import check_control, check_outcome
+from mjx_reinforce.envs.outcomes import check_control, check_outcome, check_push
 from mjx_reinforce.envs.parts import Named
 from mjx_reinforce.envs.starts import MOCAP, start_shapes
-from mjx_reinforce.envs.state import Before, Physics
+from mjx_reinforce.envs.state import Before, Physics, recollect_start, recollect_step
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco
@@ -93,6 +93,24 @@ class FieldRecorder(Named):
         return jnp.zeros(spec.shape, spec.dtype)
 
 
+def read_all(env: Any, before: Before, recorder: Any, action: jax.Array) -> None:
+    """Calls the methods of a task that read a simulation; which fields these are is recorded.
+
+    Args:
+      env: the ``MujocoEnv``.
+      before: the start of an env step.
+      recorder: a ``FieldRecorder`` in place of the simulation after it.
+      action: [A] of any numbers.
+    """
+    key = jax.random.key(0)
+    recorder.memory = before.memory = env.memory(key, recorder)
+    env.actuate(before, action)
+    env.push(before)
+    recorder.memory = env.remember(key, recorder, action)
+    env.outcome(before, recorder, action)
+    env.observe(recorder)
+
+
 def spec_of(data: Any, name: str) -> Spec:
     """Returns the shape and dtype in which a task reads a field of mjData: JAX's own of its kind.
 
@@ -131,6 +149,7 @@ class Simulations:
         randomized: Sequence[str],
         *,
         contact_forces: bool = False,
+        pushes: bool = False,
     ):
         """Simulates nothing yet.
 
@@ -139,9 +158,11 @@ class Simulations:
           fields: of mjData, which a call returns.
           randomized: fields of the model that differ from episode to episode.
           contact_forces: whether ``step`` computes ``_CONTACT_FORCES`` as well.
+          pushes: whether ``step`` adds something to the velocities.
         """
         self.model = model
         self.contact_forces = contact_forces
+        self.pushes = pushes
         self.fields = tuple(fields)
         self.randomized = tuple(randomized)
         self.num_threads = num_cores()
@@ -186,11 +207,12 @@ class Simulations:
 
         Args:
           num_steps: physics steps, under the same control.
-          inputs: which episodes run [B], state [B, S], control [B, nu], the randomized fields of
-            the model.
+          inputs: which episodes run [B], state [B, S], control [B, nu], what is added to the
+            velocities [B, nv] if something is, the randomized fields of the model.
           results: as of ``start``; those of an episode that does not run have no meaning.
         """
         running, state, control, *model_fields = inputs
+        pushes = [model_fields.pop(0)] if self.pushes else []
         ids = np.flatnonzero(running)
         with _LOCK:
             batch = self._batch(len(state))
@@ -199,6 +221,8 @@ class Simulations:
             # The rows say all that there is of a simulation: it may have been another before.
             batch.state[:] = state.view(np.float64)
             batch.bind("ctrl")[:] = control
+            for push in pushes:
+                batch.bind("qvel")[:] += push
             warnings = self._warnings(batch)
             self._set_model(batch, model_fields, ids)
             advance = functools.partial(batch.step, ids=ids, nstep=num_steps)
@@ -353,19 +377,22 @@ class InBatch(Env):
             for name in models.CONSTANT
         }
         self._simulations = Simulations(
-            env.mj_model, fields, randomized, contact_forces=env.contact_forces
+            env.mj_model,
+            fields,
+            randomized,
+            contact_forces=env.contact_forces,
+            pushes=env.has_pushes,
         )
         self._digest = models.digest(env.mj_model)
         self._step_call = self._host_step()
 
     def _fields_read(self, data: Any) -> list[str]:
         """Returns the fields of mjData that the task reads, and those that an env step hands on."""
-        recorder = FieldRecorder(data, self.env.mj_model)
+        recorder: Any = FieldRecorder(data, self.env.mj_model)
 
-        def read(start_fields: dict[str, Any], episode: dict[str, Any], action: jax.Array) -> Any:
+        def read(start_fields: dict[str, Any], episode: dict[str, Any], action: jax.Array) -> None:
             recorder.episode = episode
-            before = Before(start_fields, self.env.mj_model, episode)
-            return self.env.outcome(before, recorder, action), self.env.observe(recorder)
+            read_all(self.env, Before(start_fields, self.env.mj_model, episode), recorder, action)
 
         names = (*models.CARRIED, *models.CONSTANT, *self._carried)
         specs = {name: spec_of(data, name) for name in names}
@@ -384,6 +411,8 @@ class InBatch(Env):
         num_steps = self.env.frame_skip
         step = functools.partial(self._simulations.step, num_steps)
         inputs = [Spec((), bool), self._state_spec(), self._specs["ctrl"]]
+        if self.env.has_pushes:
+            inputs.append(self._specs["qvel"])
         return self._host_call("step", num_steps, step, inputs)
 
     def _host_call(
@@ -407,6 +436,7 @@ class InBatch(Env):
             simulations.fields,
             simulations.randomized,
             simulations.contact_forces,
+            simulations.pushes,
             options,
             results,
         )
@@ -423,22 +453,28 @@ class InBatch(Env):
 
     def reset_where(self, rng: jax.Array, is_used: jax.Array) -> State:
         """Does as ``reset`` where an episode is to begin []; else what it returns means nothing."""
+        memory_rng, rng = self.env.split_rng(rng)
         episode, start = self.env.draw(rng)
-        return self._start(start, episode, is_used)
+        return self._start(start, episode, memory_rng, is_used)
 
     def set_state(
         self,
         qpos: jax.Array,
         qvel: jax.Array,
         episode: dict[str, jax.Array] | None = None,
+        rng: jax.Array | None = None,
         **fields: jax.Array,
     ) -> State:
         """Returns the state at positions [nq] and velocities [nv], as ``MujocoEnv.set_state``."""
         start = {"qpos": qpos, "qvel": qvel, **fields}
-        return self._start(start, episode or {}, jnp.array(True))
+        return self._start(start, episode or {}, rng, jnp.array(True))
 
     def _start(
-        self, start: dict[str, jax.Array], episode: dict[str, jax.Array], is_used: jax.Array
+        self,
+        start: dict[str, jax.Array],
+        episode: dict[str, jax.Array],
+        rng: jax.Array | None,
+        is_used: jax.Array,
     ) -> State:
         """Returns the state of an episode that starts with fields of mjData, where it is to []."""
         real = jnp.result_type(float)
@@ -446,9 +482,10 @@ class InBatch(Env):
         start_fields = [jnp.asarray(x, real) for x in start.values()]
         results = begin(is_used, *start_fields, *self._model_fields(episode))
         physics, view, _ = self._simulated(results, episode)
+        physics = physics.replace(**recollect_start(self.env, rng, view)._asdict())
         zero = jnp.zeros((), real)
         action = jnp.zeros(self.action_size, real)
-        terms = self._outcome(physics, view, action)[2]
+        terms = self._outcome(self._before(physics), view, action)[2]
         metrics = dict.fromkeys(terms, zero)
         return State(cast(Any, physics), self.env.observe(view), zero, zero, metrics)
 
@@ -469,13 +506,18 @@ class InBatch(Env):
         check_shape("the action", action, (self.action_size,))
         before = cast(Physics, state.pipeline_state)
         name = type(self.env).__name__
-        control = check_control(name, self.env.control(action), action, self.mj_model.nu)
+        before_view = self._before(before)
+        actuated = self.env.actuate(before_view, action)
+        control = check_control(name, actuated, action, self.mj_model.nu)
         control = jnp.asarray(control, jnp.result_type(float))
-        results = self._step_call(
-            is_used, before.carried[STATE], control, *self._model_fields(before.episode)
-        )
+        inputs = [before.carried[STATE], control]
+        if self.env.has_pushes:
+            inputs.append(check_push(name, self.env.push(before_view), self.mj_model.nv))
+        results = self._step_call(is_used, *inputs, *self._model_fields(before.episode))
         physics, view, sound = self._simulated(results, before.episode)
-        reward, terminated, terms = self._outcome(before, view, action)
+        recollection = recollect_step(self.env, before, view, action)
+        physics = physics.replace(**recollection._asdict())
+        reward, terminated, terms = self._outcome(before_view, view, action)
         dtype = state.reward.dtype
         return dataclasses.replace(
             state,
@@ -501,12 +543,16 @@ class InBatch(Env):
         physics = Physics(**common, carried=carried, episode=episode, constants={})
         return physics, Before(fields, self.env.mj_model, episode), sound
 
-    def _outcome(self, before: Physics, view: Any, action: jax.Array) -> Any:
-        """Returns what the task's ``outcome`` returns, checked."""
+    def _before(self, state: Physics) -> Before:
+        """Returns what a task knows of the start of an env step."""
         constant = {name: jnp.asarray(value) for name, value in self._constants.items()}
-        common = {name: getattr(before, name) for name in models.CARRIED}
-        start = Before(constant | before.carried | common, self.env.mj_model, before.episode)
-        return check_outcome(type(self.env).__name__, self.env.outcome(start, view, action))
+        common = {name: getattr(state, name) for name in models.CARRIED}
+        fields = constant | state.carried | common
+        return Before(fields, self.env.mj_model, state.episode, state.memory)
+
+    def _outcome(self, before: Before, view: Any, action: jax.Array) -> Any:
+        """Returns what the task's ``outcome`` returns, checked."""
+        return check_outcome(type(self.env).__name__, self.env.outcome(before, view, action))
 
     @property
     def mj_model(self) -> MjModel:

@@ -11,8 +11,9 @@ import numpy as np
 from mjx_reinforce.engine.base import Environment
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import Before, MujocoEnv
-from mjx_reinforce.envs.in_batch import FieldRecorder, spec_of
-from mjx_reinforce.envs.outcomes import check_control
+from mjx_reinforce.envs.in_batch import FieldRecorder, read_all, spec_of
+from mjx_reinforce.envs.outcomes import check_control, check_push
+from mjx_reinforce.envs.state import NOTHING, Recollection, recollect_start, recollect_step
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco
@@ -54,17 +55,19 @@ class InMujoco:
         # Which fields a task reads does not depend on their numbers: it is traced, as under jit.
         def read(before, episode, action):
             recorder.episode = episode
-            outcome = env.outcome(self._view(before, episode), recorder, action)
-            return outcome, env.observe(recorder)
+            read_all(env, self._view(before, episode), recorder, action)
 
         jax.eval_shape(read, self._start_fields(), self._episode, jnp.zeros(env.action_size))
         self._names = sorted(recorder.names)
+        self._recollection = NOTHING
+        self._split = jax.jit(env.split_rng)
         self._start = jax.jit(env.draw)
-        self._observe = jax.jit(lambda fields, episode: env.observe(self._view(fields, episode)))
+        self._observe = jax.jit(self._first_observation)
         self._advance = jax.jit(self._outcome)
 
     def reset(self, rng: jax.Array) -> np.ndarray:
         """Begins an episode and returns its first observation [O]; consumes the key."""
+        memory_rng, rng = self._split(rng)
         self._episode, start = self._start(rng)
         # A copy, since an episode may replace fields of the model.
         self.model = model = copy.copy(self.env.mj_model)
@@ -78,7 +81,9 @@ class InMujoco:
             getattr(data, name)[:] = field
         _C.mj_forward(model, data)
         self.data = data
-        return np.asarray(self._observe(self._fields(), self._episode))
+        fields = self._fields()
+        observation, self._recollection = self._observe(memory_rng, fields, self._episode)
+        return np.asarray(observation)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
         """Returns the next observation [O], the reward, and whether the episode ended.
@@ -91,28 +96,43 @@ class InMujoco:
         before = self._start_fields()
         name = type(self.env).__name__
         # Not compiled: a control of NumPy's numbers keeps their precision.
-        control = self.env.control(cast(Any, action))
+        before_view = self._view(before, self._episode, self._recollection)
+        control = self.env.actuate(before_view, cast(Any, action))
         self.data.ctrl[:] = check_control(name, control, action, self.model.nu)
+        if self.env.has_pushes:
+            push = check_push(name, self.env.push(before_view), self.model.nv)
+            self.data.qvel[:] += np.asarray(push)
         _C.mj_step(self.model, self.data, self.env.frame_skip)
         if self.env.contact_forces:
             _C.mj_rnePostConstraint(self.model, self.data)
-        observation, reward, terminated = self._advance(
-            before, self._fields(), self._episode, np.asarray(action)
+        observation, reward, terminated, self._recollection = self._advance(
+            before, self._fields(), self._episode, self._recollection, np.asarray(action)
         )
         # The task would pay for where MuJoCo has put the body back.
         if was_reset(self.data):
             reward = np.nan
         return np.asarray(observation), float(reward), bool(terminated)
 
-    def _outcome(self, before, fields, episode, action):
+    def _first_observation(self, memory_rng, fields, episode):
         data = self._view(fields, episode)
-        before = self._view(before, episode)
-        reward, terminated, _ = self.env.outcome(before, data, action)
-        return self.env.observe(data), reward, terminated
+        recollection = recollect_start(self.env, memory_rng, data)
+        return self.env.observe(data), recollection
 
-    def _view(self, fields: dict[str, Any], episode: dict[str, Any]) -> Any:
+    def _outcome(self, before, fields, episode, recollection, action):
+        data = self._view(fields, episode)
+        next_recollection = recollect_step(self.env, recollection, data, action)
+        before = self._view(before, episode, recollection)
+        reward, terminated, _ = self.env.outcome(before, data, action)
+        return self.env.observe(data), reward, terminated, next_recollection
+
+    def _view(
+        self,
+        fields: dict[str, Any],
+        episode: dict[str, Any],
+        recollection: Recollection = NOTHING,
+    ) -> Any:
         """Returns fields of mjData as the task reads them."""
-        return Before(fields, self.env.mj_model, episode)
+        return Before(fields, self.env.mj_model, episode, recollection.memory)
 
     def _fields(self) -> dict[str, np.ndarray]:
         """Returns what the task reads of the simulation, in the shapes that tasks read."""

@@ -112,6 +112,57 @@ def check_episode(name: str, episode: object, model: MjModel) -> dict[str, jax.A
     return arrays
 
 
+def check_memory(
+    name: str, method: str, entries: object, before: dict[str, jax.Array] | None = None
+) -> dict[str, jax.Array]:
+    """Returns what an episode is to remember, as arrays, if it is entries by their names.
+
+    Args:
+      name: of the task.
+      method: which of its methods returned the entries.
+      entries: what it returned.
+      before: what the episode remembered so far, of which shapes and dtypes stay.
+
+    Raises:
+      ValueError: it is something else.
+    """
+    is_named = isinstance(entries, dict) and all(isinstance(key, str) for key in entries)
+    requirement = f"{name}.{method} must return a dict of arrays by their names"
+    require(is_named, f"{requirement}, got {in_words(entries)}")
+    memory = dict(cast(Any, entries))
+    for key, value in memory.items():
+        entry = f"{key!r} of {name}.{method}"
+        require(shape_of(value) is not None, f"{entry} must be an array, got {in_words(value)}")
+    if before is None:
+        return {key: jnp.asarray(value) for key, value in memory.items()}
+    require(
+        memory.keys() == before.keys(),
+        f"{name}.{method} must return what {name}.memory does ({', '.join(before) or 'nothing'}), "
+        f"got {', '.join(memory) or 'nothing'}",
+    )
+    for key, value in memory.items():
+        check_shape(f"{key!r} of {name}.{method}", value, before[key].shape)
+    return {key: jnp.asarray(memory[key], before[key].dtype) for key in before}
+
+
+def check_push(name: str, push: Any, size: int) -> jax.Array:
+    """Returns what ``push`` returned, if it is a change of each velocity.
+
+    Args:
+      name: of the task.
+      push: what it returned.
+      size: nv of the model.
+
+    Raises:
+      ValueError: it is something else.
+    """
+    require(
+        shape_of(push) == (size,),
+        f"{name}.push must return [{size}], a change of each velocity, got {in_words(push)}",
+    )
+    return jnp.asarray(push, jnp.result_type(float))
+
+
 def check_centers(
     name: str, randomize: Callable[[jax.Array], dict[str, Any]], center: jax.Array, model: MjModel
 ) -> None:

@@ -64,14 +64,16 @@ class Part:
 
 
 class Named:
-    """Has the fields of mjData; their rows by name, and what was drawn for the episode.
+    """Has the fields of mjData; their rows by name, and what belongs to the episode.
 
     mj_model: whose names they are
     episode: what ``MujocoEnv.randomize`` returned for this episode
+    memory: what the episode remembers, see ``MujocoEnv.memory``
     """
 
     mj_model: MjModel
     episode: dict[str, Any]
+    memory: dict[str, Any]
 
     def body(self, name: str) -> Part:
         """Returns a body: ``xpos`` [3], ``xquat`` [4], ``xmat``, ``cvel``, ..., as in mjData."""
@@ -109,8 +111,15 @@ class Named:
 class View(Named, Simulation):
     """A simulation as a task reads it: every field of mjData, and parts by their names."""
 
-    def __init__(self, data: Any, mj_model: MjModel, episode: dict[str, Any]):
+    def __init__(
+        self,
+        data: Any,
+        mj_model: MjModel,
+        episode: dict[str, Any],
+        memory: dict[str, Any] | None = None,
+    ):
         """Shows an ``mjx.Data``."""
         super().__init__(data)
         self.mj_model = mj_model
         self.episode = episode
+        self.memory = memory or {}

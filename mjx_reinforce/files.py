@@ -120,6 +120,20 @@ def check_module(path: Path, example: str) -> None:
         )
 
 
+def check_header(path: Path, example: str) -> None:
+    """Raises ValueError for a header whose name does not begin the names of C in it.
+
+    The message has the ``example`` of a better --output.
+    """
+    name = path.stem
+    # C keeps names for itself that begin with an underscore.
+    if not (name.isascii() and name.isidentifier()) or name.startswith("_"):
+        raise ValueError(
+            f"C has no names that begin with {name!r}; choose an --output of letters, digits and "
+            f"underscores, such as {example}"
+        )
+
+
 def _sync(folder: Path) -> None:
     """Waits until the names in a folder are on the disk."""
     descriptor = os.open(folder, os.O_RDONLY)

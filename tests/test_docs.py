@@ -8,8 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from c_programs import needs_compiler
 from command_lines import run_command
+from exports import run_export
 from saved_runs import make_run
 
 import mjx_reinforce
@@ -101,6 +104,22 @@ def test_python_of_page_runs(name, tmp_path):
     """Every Python block of a page, in order, in one program, beside a trained run."""
     make_run(tmp_path / "pendulum", "InvertedPendulum-v5")
     run_smaller(name, "\n".join(blocks(page(name), "python")), tmp_path)
+
+
+@needs_compiler
+def test_c_of_policies_runs(tmp_path, monkeypatch):
+    """The page's program, by its line for the compiler, beside the header of its command."""
+    run = make_run(tmp_path / "pendulum", "InvertedPendulum-v5")
+    monkeypatch.chdir(tmp_path)
+    (code,) = blocks(page("policies.md"), "c")
+    (commands,) = [x for x in blocks(page("policies.md"), "sh") if ".h\n" in x]
+    (tmp_path / "robot.c").write_text(code)
+    export, compile_program = commands.splitlines()
+    run_export(monkeypatch, *export.removeprefix("python -m mjx_reinforce.export ").split())
+    subprocess.run(compile_program.split(), check=True)
+    printed = subprocess.run("./robot", check=True, capture_output=True, text=True).stdout
+    expected = mjx_reinforce.load(run).act(np.array([0.0, 0.1, 0.0, 0.0]))
+    assert float(printed) == pytest.approx(expected[0], abs=1e-6)
 
 
 #: What Stable-Baselines3's classes ask of a ``VecEnv``, in place of a package that needs torch.

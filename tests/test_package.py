@@ -156,6 +156,17 @@ def test_folders_are_small():
     assert {str(folder): n for folder, n in sizes.items() if n > 14} == {}
 
 
+def test_lines_of_cpp_fit():
+    """As ruff holds those of Python to 100 columns."""
+    lines = [
+        f"{path.name}:{number}"
+        for path in sorted(ROOT.glob("mjx_reinforce/**/*.h"))
+        for number, line in enumerate(path.read_text("utf-8").splitlines(), start=1)
+        if len(line) > 100
+    ]
+    assert lines == []
+
+
 def test_no_size_is_above_its_ceiling():
     """Each size that has a ceiling is at most that ceiling."""
     ceilings = tomllib.loads((TESTS / "ceilings.toml").read_text("utf-8"))

@@ -5,7 +5,7 @@ import importlib
 import re
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,10 @@ COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
 #: What a simulation carries from step to step.
 STATE = ("qpos", "qvel", "qacc_warmstart")
 
-#: (state by the names of ``STATE``, which changes in place; controls [nu]; number of steps) ->
-#: what the last step reports, by the names of ``report_sizes``.
-Steps = Callable[[dict[str, np.ndarray], np.ndarray, int], dict[str, np.ndarray]]
+#: (state by the names of ``STATE``, which changes in place; controls [nu]; number of steps; where
+#: fields are random the numbers of ``tables.drawn_numbers``) -> what the last step reports, by the
+#: names of ``report_sizes``.
+Steps = Callable[..., dict[str, np.ndarray]]
 
 
 def report_sizes(model: Any) -> dict[str, int]:
@@ -34,7 +35,13 @@ def report_sizes(model: Any) -> dict[str, int]:
     return sizes | {"pass_qacc": model.nv, "touch": num_touches}
 
 
-def compiled(model: Any, folder: Path, num_near: int = tables.NUM_NEAR, lanes: int = 1) -> Steps:
+def compiled(
+    model: Any,
+    folder: Path,
+    num_near: int = tables.NUM_NEAR,
+    lanes: int = 1,
+    random: Collection[str] = (),
+) -> Steps:
     """Returns what plays a model's physics steps.
 
     Args:
@@ -42,12 +49,13 @@ def compiled(model: Any, folder: Path, num_near: int = tables.NUM_NEAR, lanes: i
       folder: for the text and the library, of its own for each call.
       num_near: contacts that the state of a team has room for.
       lanes: of the team; several take turns, see ``turns.h``.
+      random: the names of fields of the model that differ from episode to episode.
 
     Raises:
       UnsupportedPrimitive: the device code lacks something that the model has.
     """
     kit = Path(__file__).parent
-    text = tables.physics_text(model, num_near).split("// The operations of")[0]
+    text = tables.physics_text(model, num_near, random).split("// The operations of")[0]
     run = "play()"
     if lanes > 1:
         turns = (kit / "turns.h").read_text("utf-8")
@@ -66,13 +74,17 @@ def compiled(model: Any, folder: Path, num_near: int = tables.NUM_NEAR, lanes: i
     ends = np.cumsum([*sizes.values()])
 
     def play(
-        state: dict[str, np.ndarray], control: np.ndarray, num_steps: int
+        state: dict[str, np.ndarray],
+        control: np.ndarray,
+        num_steps: int,
+        drawn: np.ndarray | None = None,
     ) -> dict[str, np.ndarray]:
         """Makes so many physics steps; see ``Steps``."""
         ctrl = np.resize(control, max(model.nu, 1)).astype(float)
         report = np.zeros(ends[-1])
         numbers = [state[name] for name in STATE]
-        start = [_pointer(x) for x in (*numbers, ctrl)]
+        drawn = np.zeros(0) if drawn is None else drawn
+        start = [_pointer(x) for x in (*numbers, ctrl, drawn)]
         play_steps(*start, num_steps, _pointer(report))
         return dict(zip(sizes, np.split(report, ends[:-1]), strict=True))
 

@@ -1,13 +1,24 @@
 // Plays physics steps of float64 and writes down what they report.
-static const Model MODEL MODEL_INIT;
+static const Fixed FIXED MODEL_INIT;
 static State s;
 static Contact far[FAR + 1];
 static int steps;
 static bool sound;
-static void play() { sound = physics(Team(), MODEL, s, steps); }
+static const double* drawn_numbers;
+static void play() {
+  const Team t;
+  const int lane = t.lane;
+  const Model& M = model_of(FIXED, s, lane);
+  t.sync();
+  draw(M, s, drawn_numbers, lane);
+  t.sync();
+  const bool is_sound = physics(t, M, s, steps);
+  if (lane == 0) sound = is_sound;
+}
 
-extern "C" int play_steps(double* qpos, double* qvel, double* qacc, const double* ctrl, int skip,
-                          double* out) {
+extern "C" int play_steps(double* qpos, double* qvel, double* qacc, const double* ctrl,
+                          const double* drawn, int skip, double* out) {
+  drawn_numbers = drawn;
   s.far = far;
   steps = skip;
   for (int i = 0; i < NQ; i++) s.qpos[i] = qpos[i];

@@ -204,12 +204,14 @@ class PhysicsModel(NamedTuple):
 
     mj_model: the model
     frame_skip: physics steps an env step, all under the same control
-    digest: the name of both, the same in every process
+    digest: the name of all else, the same in every process
+    random: the names of the model's fields that differ from episode to episode
     """
 
     mj_model: MjModel
     frame_skip: int
     digest: str
+    random: tuple[str, ...] = ()
 
 
 #: JAX keeps what it traced with one value of this apart from what it traced with another.

@@ -26,6 +26,8 @@ _LIBRARIES = [path.resolve() for path in (*_PYTHON, _PACKAGE, _PACKAGE / "envs")
 _MAX_MESSAGE = 300
 #: How alike names are, as ``difflib`` counts, of which a third of the letters differ.
 _MIN_SIMILARITY = 0.66
+#: The greatest of what an update counts, such as its env steps: they are int32.
+MAX_OF_UPDATE = 2**31 - 1
 #: What every environment has.
 _MEMBERS = ("reset", "step", "action_size")
 
@@ -276,10 +278,12 @@ def check_number(name: str, value: object, *, positive: bool = False, finite: bo
 
 
 def check_count(name: str, value: int, minimum: int = 1) -> None:
-    """Raises ValueError for what is no whole number, or one that is less than ``minimum``."""
+    """Raises ValueError for what is no whole number, or not from ``minimum`` to 2^31 - 1."""
     check_type(name, value, int)
     if value < minimum:
         raise ValueError(f"{name} must be at least {minimum}, got {value}")
+    if value > MAX_OF_UPDATE:
+        raise ValueError(f"{name} must be less than 2^31, got {value}")
 
 
 def check_key(key: object) -> None:

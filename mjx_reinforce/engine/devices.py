@@ -28,6 +28,11 @@ def memory_here() -> float:
     return float((device.memory_stats() or {}).get("bytes_limit", float("inf")))
 
 
+def bytes_of(shapes: PyTree) -> float:
+    """Returns the bytes of arrays, or of their shapes."""
+    return float(sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(shapes)))
+
+
 def check_room(num_bytes: float) -> None:
     """Raises ValueError if so many bytes are not there."""
     memory = memory_here()

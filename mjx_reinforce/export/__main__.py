@@ -6,13 +6,13 @@ from pathlib import Path
 import tyro
 
 from mjx_reinforce.export.run_files import PolicyChoice, Run, SeedChoice, read_run
-from mjx_reinforce.files import check_module, check_output
+from mjx_reinforce.files import check_header, check_module, check_output
 from mjx_reinforce.settings.flags import run_command
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ExportSettings:
-    """Write a trained policy for NumPy alone: an .npz archive and a short .py. It has no noise."""
+    """Write a trained policy for NumPy alone, or for C as one header. It has no noise."""
 
     run: tyro.conf.Positional[Path]
     """A run directory, or a task whose trained policy comes with the package."""
@@ -21,8 +21,9 @@ class ExportSettings:
     which: PolicyChoice = "last"
     """The policy at the end of training (last), or the best at any evaluation, if it was kept."""
     output: Path | None = None
-    """The archive, .npz. By default seed_NUMBER in the run directory, or the name of the task in
-    the current folder for a policy of the package."""
+    """For NumPy the archive, .npz, beside which goes a short .py; for C and C++ the header, .h. By
+    default seed_NUMBER.npz in the run directory, or the name of the task and .npz in the current
+    folder for a policy of the package."""
     overwrite: bool = False
     """Replace files that exist."""
 
@@ -40,15 +41,23 @@ def export(settings: ExportSettings) -> list[Path]:
       OSError: a file cannot be written.
     """
     run = read_run(settings.run)
-    from mjx_reinforce.export.arithmetic import numpy_policy
+    from mjx_reinforce.export.arithmetic import policy_arithmetic
+    from mjx_reinforce.export.c_header import c_header
+    from mjx_reinforce.export.numpy_policy import numpy_policy
     from mjx_reinforce.export.policy_files import load_seed
     from mjx_reinforce.files import write_arrays, write_bytes
 
     player, saved = load_seed(run, settings.seed, settings.which)
     outputs = output_files(settings, run, player.seed)
-    arrays, source = numpy_policy(saved, outputs[0].stem, player.env, player.seed)
-    write_arrays(outputs[0], arrays)
-    write_bytes(outputs[1], source.encode())
+    name = outputs[0].stem
+    arithmetic = policy_arithmetic(saved)
+    if outputs[0].suffix.lower() == ".h":
+        run_name = run.directory.resolve().name
+        source = c_header(arithmetic, name, run_name, player.env, player.seed)
+    else:
+        arrays, source = numpy_policy(arithmetic, name, player.env, player.seed)
+        write_arrays(outputs[0], arrays)
+    write_bytes(outputs[-1], source.encode())
     return outputs
 
 
@@ -62,8 +71,11 @@ def output_files(settings: ExportSettings, run: Run, seed: int) -> list[Path]:
     if run.packaged:
         default_path = Path(f"{run.env.replace('-', '_')}.npz")
     output = settings.output or default_path
+    check_output(output, settings.overwrite, ".npz", ".h")
+    if output.suffix.lower() == ".h":
+        check_header(output, "policy.h")
+        return [output]
     module = output.with_suffix(".py")
-    check_output(output, settings.overwrite, ".npz")
     check_module(module, "policy.npz")
     check_output(module, settings.overwrite, ".py")
     return [output, module]

@@ -162,8 +162,7 @@ def read_policy(
         )
     with naming_damage(settings_path):
         policy = played_policy(settings)
-        # Traced, not computed: the shapes are known in milliseconds.
-        shapes = arrays_of(jax.eval_shape(functools.partial(_untrained, policy, settings)))
+        shapes = _shapes(policy, settings)
     with naming_damage(actor_path):
         num_seeds = _check_shapes(arrays, shapes)
     if seed is not None and not 0 <= seed < num_seeds:
@@ -180,6 +179,17 @@ def read_policy(
         arrays = {name: array[seed] for name, array in arrays.items()}
     actor = jax.tree.map(jnp.asarray, actor_of(arrays))
     return SavedPolicy(policy, actor, settings, num_seeds)
+
+
+def check_arrays(arrays: Arrays, settings: dict[str, Any]) -> None:
+    """Raises ValueError for arrays [S, ...] by ``arrays_of`` that no policy of the settings has."""
+    _check_shapes(arrays, _shapes(played_policy(settings), settings))
+
+
+def _shapes(policy: Policy, settings: dict[str, Any]) -> dict[str, Any]:
+    """Returns what has the shape and the type of each array of a policy, by its name."""
+    # Traced, not computed: the shapes are known in milliseconds.
+    return arrays_of(jax.eval_shape(functools.partial(_untrained, policy, settings)))
 
 
 def _untrained(policy: Policy, settings: dict[str, Any]) -> Actor:
@@ -211,7 +221,7 @@ def _check_shapes(arrays: Arrays, shape_tree: dict[str, Any]) -> int:
         is_readable = array.dtype.isnative and array.dtype.itemsize <= np.dtype(float).itemsize
         if array.shape != shape or array.dtype.kind != np.dtype(kind).kind or not is_readable:
             raise ValueError(
-                f"{name} is {array.dtype}{list(array.shape)}, and the settings in policy.json make "
+                f"{name} is {array.dtype}{list(array.shape)}, and the settings of the policy make "
                 f"it {kind}{list(shape)}"
             )
     return num_seeds

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_reinforce.engine.base import Environment, PyTree, Trajectory, null_action
-from mjx_reinforce.engine.checks import check_kind, check_type, explain
+from mjx_reinforce.engine.checks import MAX_OF_UPDATE, check_count, check_kind, explain
 from mjx_reinforce.engine.contract import described
 from mjx_reinforce.learning import updates
 from mjx_reinforce.learning.distributions import Distribution
@@ -25,10 +25,18 @@ def check_horizon(env: Environment, horizon: int | None) -> int:
         horizon = getattr(env, "max_episode_steps", None)
     if horizon is None:
         raise ValueError("the env declares no max_episode_steps: give a horizon (--horizon N)")
-    check_type("horizon", horizon, int)
-    if horizon < 1:
-        raise ValueError(f"the horizon must be at least one step, got {horizon}")
+    check_count("horizon", horizon)
     return horizon
+
+
+def check_num_steps(num_episodes: int, horizon: int) -> None:
+    """Raises ValueError where an update may have more env steps than are counted."""
+    num_steps = num_episodes * horizon
+    if num_steps > MAX_OF_UPDATE:
+        raise ValueError(
+            f"an update may have {num_steps:,} env steps ({num_episodes:,} episodes of "
+            f"{horizon:,}), and fewer than 2^31 are counted; lower --num-episodes or --horizon"
+        )
 
 
 def check_policy(

@@ -17,7 +17,7 @@ from jax.flatten_util import ravel_pytree
 from mjx_reinforce.engine.base import Environment, Trajectory, action_space, observation_size
 from mjx_reinforce.engine.checks import check_count, check_key, check_kind, check_number
 from mjx_reinforce.engine.contract import check_environment
-from mjx_reinforce.engine.devices import check_room
+from mjx_reinforce.engine.devices import bytes_of, check_room
 from mjx_reinforce.engine.episode import check_each, episode_keys
 from mjx_reinforce.engine.play import choice
 from mjx_reinforce.engine.play.choice import Engine, Rollout
@@ -204,6 +204,7 @@ def reinforce(
     if max_kl is not None:
         check_number("max_kl", max_kl, positive=True, finite=False)
     horizon = contract.check_horizon(env, horizon)
+    contract.check_num_steps(num_episodes, horizon)
     if policy is None:
         policy = mlp_policy(size, default_distribution(action_space(env)))
     contract.check_policy(policy, env, size, likelihood=True)
@@ -218,10 +219,7 @@ def reinforce(
         estimator = standardize(leave_one_out(), floor=10.0)
     contract.check_estimator(estimator, env, size, num_episodes)
 
-    # Shapes alone, so that a network that is too large is refused before it takes its memory.
-    actor_shapes = jax.eval_shape(functools.partial(first_actor, policy, size), jax.random.key(0))
-    # Three times: the parameters, their gradient, and what they become.
-    check_room(3.0 * sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(actor_shapes)))
+    actor_shapes = _actor_shapes(policy, estimator, size)
     actor_policy = choice.ActingPolicy(
         functools.partial(act, policy), actor_shapes, policy.distribution
     )
@@ -260,6 +258,18 @@ class RolloutPlay:
     ) -> Any:
         """Plays for one update."""
         return self.function(state, key, active, rollout)
+
+
+def _actor_shapes(policy: Policy, estimator: Estimator, observation_size: int) -> Actor:
+    """Returns the shapes of an actor, or raises ValueError where training it has no room."""
+    # Shapes alone, so that a network that is too large is refused before it takes its memory.
+    key = jax.random.key(0)
+    actor_shapes = jax.eval_shape(functools.partial(first_actor, policy, observation_size), key)
+    estimator_shapes = jax.eval_shape(lambda key: estimator.init(key, observation_size), key)
+    # Three times: the parameters, their gradient, and what they become. Twice: what an estimator
+    # has learned, and what that becomes.
+    check_room(3 * bytes_of(actor_shapes) + 2 * bytes_of(estimator_shapes))
+    return actor_shapes
 
 
 def first_actor(policy: Policy, observation_size: int, key: jax.Array) -> Actor:

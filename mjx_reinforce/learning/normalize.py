@@ -63,7 +63,7 @@ def update(
     """
     # With an empty mask the batch has no weight, and everything below leaves the statistics alone:
     # there is no branch, which would be run both ways under ``vmap`` anyway.
-    mask = mask & (normalizer.count < max_count)
+    mask = mask & (normalizer.count < jnp.asarray(max_count, normalizer.count.dtype))
     is_played = mask[..., None]
     observation = jnp.clip(observation, -_MAX_OBSERVATION, _MAX_OBSERVATION)
     count = jnp.sum(mask, dtype=normalizer.count.dtype)

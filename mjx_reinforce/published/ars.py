@@ -25,6 +25,7 @@ import mjx_reinforce as mr
 from mjx_reinforce.engine import base, choose
 from mjx_reinforce.engine.checks import check_count, check_key, check_number
 from mjx_reinforce.engine.contract import check_environment
+from mjx_reinforce.engine.devices import bytes_of, check_room
 from mjx_reinforce.engine.play.choice import Engine
 from mjx_reinforce.engine.play.rollouts import episode_returns
 from mjx_reinforce.learning import contract, normalize
@@ -100,7 +101,13 @@ def ars(
     check_number("normalize_min_std", normalize_min_std)
     if policy is None:
         policy = _zero_policy(env)
-    contract.check_policy(policy, env, base.observation_size(env))
+    size = base.observation_size(env)
+    contract.check_policy(policy, env, size)
+    # The parameters, and what they become.
+    actor_shapes = jax.eval_shape(functools.partial(first_actor, policy, size), jax.random.key(0))
+    check_room(2 * bytes_of(actor_shapes))
+    horizon = contract.check_horizon(env, horizon)
+    contract.check_num_steps(2 * num_directions, horizon)
     search = _Search(
         env=env,
         policy=policy,
@@ -108,7 +115,7 @@ def ars(
         step_size=step_size,
         noise_std=noise_std,
         increment=mean_difference if increment is None else increment,
-        horizon=contract.check_horizon(env, horizon),
+        horizon=horizon,
         normalize_steps=normalize_steps,
         normalize_min_std=normalize_min_std,
         engine=choose(engine, env),

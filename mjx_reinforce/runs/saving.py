@@ -19,10 +19,11 @@ import numpy as np
 
 from mjx_reinforce import files
 from mjx_reinforce.console.commands import typed
-from mjx_reinforce.export.policy_files import actor_of, arrays_of, save_policy
+from mjx_reinforce.export.policy_files import actor_of, arrays_of, check_arrays, save_policy
 from mjx_reinforce.files import (
     Arrays,
     check_place,
+    naming_damage,
     read_arrays,
     remove_leftovers,
     write_arrays,
@@ -37,7 +38,7 @@ from mjx_reinforce.runs.sinks import Sink, open_sinks
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup.provenance import provenance
 from mjx_reinforce.training import resume
-from mjx_reinforce.training.driver import Driver, DriverT, Evaluation, Observer, RunDriver
+from mjx_reinforce.training.driver import Driver, DriverT, Evaluation, Observer, RunDriver, Runs
 from mjx_reinforce.training.record import HEADER, lines
 from mjx_reinforce.training.resume import Checkpoint
 
@@ -346,6 +347,11 @@ class SweepFiles(Files[Driver]):
         self._parts.mkdir(exist_ok=True)
         # The folders in parts/ are those of chunks' checkpoints.
         remove_leftovers(*self._parts.glob("*/"))
+        # Before anything is trained: they are joined when all is.
+        for group_plan in self._plan.group_plans:
+            for runs in group_plan.chunks:
+                if self.has(runs.name):
+                    _check_part(self._parts / f"{runs.name}.npz", runs, group_plan.ready.policy)
 
     def has(self, chunk: str) -> bool:
         """Returns whether the runs of a chunk have ended."""
@@ -446,6 +452,34 @@ class SweepFiles(Files[Driver]):
                 settings["env_set"] = list(config.env_set)
             settings["seeds"] = seeds.tolist()
             write_json(policy_folder / "config.json", settings)
+
+
+def _check_part(path: Path, runs: Runs, policy: dict[str, Any]) -> None:
+    """Raises ValueError for the part of a chunk that is not of its runs.
+
+    Args:
+      path: of the part.
+      runs: of the chunk.
+      policy: the settings of the policies in it.
+    """
+    part = read_arrays(path, stored=True)
+    with naming_damage(path):
+        table_shape = (len(part["eval_return"]), len(runs.seed))
+        for name, dtype in _CURVE_TYPES.items():
+            array = part.pop(name)
+            shape = table_shape if name in ("eval_return", "env_steps") else table_shape[1:]
+            if array.dtype != dtype or array.shape != shape:
+                raise ValueError(
+                    f"{name} is {array.dtype}{list(array.shape)}, not {np.dtype(dtype)}"
+                    f"{list(shape)}; remove it, and its runs are trained again"
+                )
+            if name in runs._fields and not np.array_equal(array, getattr(runs, name)):
+                raise ValueError(f"{name} is that of other runs; remove it, and these are trained")
+        ends = {name.removeprefix("ends/"): array for name, array in part.items()}
+        own_shapes = [ends.pop(name).shape for name in ("configuration", "seed", "eval_return")]
+        check_arrays(ends, policy)
+        if any(shape != ends["normalizer/count"].shape for shape in own_shapes):
+            raise ValueError("its ends are not of as many runs as their policies")
 
 
 def _ends(last_arrays: Arrays, configuration_number: int) -> np.ndarray:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mjx_reinforce import envs
-from mjx_reinforce.engine.checks import changed_fields, check_type
+from mjx_reinforce.engine.checks import MAX_OF_UPDATE, changed_fields, check_type
 from mjx_reinforce.envs.settings import split_words
 from mjx_reinforce.registry import (
     ALGORITHMS,
@@ -22,7 +22,7 @@ from mjx_reinforce.registry import (
     is_own,
 )
 from mjx_reinforce.settings.declare import MAX_COUNT as MAX_COUNT
-from mjx_reinforce.settings.declare import MAX_OF_UPDATE, Range
+from mjx_reinforce.settings.declare import Range
 from mjx_reinforce.settings.groups import (
     CheckpointSettings,
     EstimatorSettings,

@@ -10,12 +10,12 @@ import math
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from mjx_reinforce.engine.checks import MAX_OF_UPDATE
+
 Value = TypeVar("Value")
 
 #: What is counted exactly, as a double does; see ``learning.counts``.
 MAX_COUNT = 2**53
-#: The greatest of what an update counts, such as its env steps: they are int32.
-MAX_OF_UPDATE = 2**31 - 1
 
 
 class Range(enum.Enum):

@@ -151,7 +151,7 @@ class PolicySettings:
     )
     """Standard deviation of the actions after --decay-steps, apart from what is learned. With
     --max-kl it may stay larger. None: learned only."""
-    normalize_steps: int | None = setting(1000, Range.AT_LEAST_0, Range.INT32)
+    normalize_steps: int | None = setting(1000, Range.AT_LEAST_0, Range.COUNTED)
     """Scale observations by their mean and standard deviation over the first env steps, about this
     many. 0: do not scale. None: update the statistics throughout training."""
     normalize_min_std: float = setting(0.0, Range.NOT_NEGATIVE, Reader.NORMALIZATION, Mark.TRACED)

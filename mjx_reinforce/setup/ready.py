@@ -251,12 +251,13 @@ def save_ready(key: str, ready: Ready) -> Ready:
         "advance": (rows, budget, occupied, evaluation_due),
         "evaluate": (rows, occupied),
     }
-    exported = {
-        name: cache.keep(f"{key}-{name}", getattr(programs, name), arguments[name])
-        for name in _PROGRAM_NAMES
-    }
-    programs = programs._replace(**exported)
-    return ready._replace(programs=lambda: programs)
+
+    def keep(name: str, program: Callable[..., Any]) -> Callable[..., Any]:
+        return cache.keep(f"{key}-{name}", program, arguments[name])
+
+    # Each when it is asked for: while XLA compiles the one, the next is traced.
+    kept_programs = programs._replace(keep=keep)
+    return ready._replace(programs=lambda: kept_programs)
 
 
 def load_ready(key: str, division: Division = ALONE) -> Ready | None:

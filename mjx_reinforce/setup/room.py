@@ -11,10 +11,10 @@ import jax
 
 from mjx_reinforce.engine.base import Environment, observation_size
 from mjx_reinforce.engine.devices import check_room
+from mjx_reinforce.learning.contract import check_num_steps
 from mjx_reinforce.learning.policy import Policy
 from mjx_reinforce.learning.updates import chunk_length, num_noise_episodes
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.settings.declare import MAX_OF_UPDATE
 from mjx_reinforce.settings.groups import Reader
 
 _FLOAT_SIZE = 4
@@ -41,12 +41,7 @@ def check_networks(
       horizon: T, the time limit of a training episode in steps.
       num_seeds: how many a device trains at once.
     """
-    num_steps = config.episodes_per_update * horizon
-    if num_steps > MAX_OF_UPDATE:
-        raise ValueError(
-            f"an update may have {num_steps:,} env steps ({config.episodes_per_update:,} episodes "
-            f"of {horizon:,}), and fewer than 2^31 are counted; lower --num-episodes or --horizon"
-        )
+    check_num_steps(config.episodes_per_update, horizon)
     num_bytes = num_seeds * float(_of_seed(config, policy, observation_size(env), horizon))
     check_room(num_bytes)
 

@@ -13,7 +13,7 @@ from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.training.record import HOPELESS, Measured, Record, RunRecord
-from mjx_reinforce.training.resume import Checkpoint, decisive
+from mjx_reinforce.training.resume import Checkpoint, check_arrays, decisive
 from mjx_reinforce.training.slots import Slots, Stopwatch
 from mjx_reinforce.training.state import Best, Budget, StateRows, begin_with, first_best, keep_best
 
@@ -85,7 +85,9 @@ _CALL_SECONDS = 0.25
 
 def check_layout(checkpoint: Checkpoint, slots: Slots) -> None:
     """Raises ValueError for a checkpoint of another program."""
-    if checkpoint.layout != slots.layout.layout:
+    rows, own_rows = checkpoint.states, slots.rows()
+    is_other = rows.shape != own_rows.shape or rows.dtype != own_rows.dtype
+    if is_other or checkpoint.layout != slots.layout.layout:
         raise ValueError(
             "the states in the checkpoint do not fit this version of the program; resume with "
             "the version that wrote it"
@@ -140,6 +142,7 @@ class Driver:
     def restore(self, checkpoint: Checkpoint) -> None:
         """Goes back to a checkpoint, or raises ValueError if it is another program's."""
         check_layout(checkpoint, self.slots)
+        check_arrays(checkpoint, self.checkpoint())
         self.slots.restore(checkpoint.states)
         self.record.restore(checkpoint.record)
         # As if the run had not stopped: its clock goes on from the time in the checkpoint.

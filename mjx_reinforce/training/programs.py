@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 
 from mjx_reinforce.engine.base import Environment, Trajectory, plain
+from mjx_reinforce.engine.checks import check_count
 from mjx_reinforce.engine.episode import episode_keys
 from mjx_reinforce.engine.play.rollouts import episode_lengths, episode_returns
 from mjx_reinforce.learning import counts
@@ -205,6 +206,9 @@ def evaluate(
       active: [] where False nothing is played, and what is returned says nothing.
       sampled: whether the second N are played.
 
+    Raises:
+      ValueError: N or T is not from 1 to 2^31 - 1.
+
     Examples:
       >>> import jax
       >>> import mjx_reinforce as mr
@@ -215,6 +219,8 @@ def evaluate(
       >>> 1 <= metrics["eval_return"].item() <= 20
       True
     """
+    check_count("num_episodes", num_episodes)
+    check_count("horizon", horizon)
     evaluation = evaluation_episodes(key, num_episodes=num_episodes, active=active, sampled=sampled)
     trajectory = learner.engine.rollout(
         env,
@@ -272,6 +278,7 @@ class Programs(NamedTuple):
     like: the shapes of a ``RunState``
     division: among which devices the runs are divided; R are those of one device
     calls_c: whether C MuJoCo computes the physics
+    keep: (name, program) -> the program as it is kept on disk, which traces it; see ``kept``
     """
 
     begin: Callable[..., tuple[jax.Array, jax.Array]]
@@ -281,6 +288,11 @@ class Programs(NamedTuple):
     like: RunState
     division: Division = ALONE
     calls_c: bool = False
+    keep: Callable[[str, Callable[..., Any]], Callable[..., Any]] = lambda _, program: program
+
+    def kept(self, name: str) -> Callable[..., Any]:
+        """Returns a program as it is compiled: traced and written to disk now, if it is kept."""
+        return self.keep(name, getattr(self, name))
 
     @property
     def state_bytes(self) -> int:

@@ -326,6 +326,9 @@ def _decode(archive_bytes: bytes, path: Path) -> Checkpoint:
         json_fields = json.loads(str(archive_arrays.pop("rest")))
         rows = {name: archive_arrays.pop(name) for name in _ROW_FIELDS}
         record = {name.removeprefix("record/"): x for name, x in archive_arrays.items()}
+        # By these a checkpoint is chosen, before there is a run to compare its arrays with.
+        for name in ("env_steps", "updates"):
+            record[name].max()
         # Another version's fields are no arguments of this class: TypeError.
         return Checkpoint(record=record, number=_number(path), **rows, **json_fields)
     except (KeyError, TypeError, zipfile.BadZipFile, ValueError) as error:
@@ -333,6 +336,49 @@ def _decode(archive_bytes: bytes, path: Path) -> Checkpoint:
             f"{path} does not fit this version of the program ({error}); "
             "resume with the version that wrote it"
         ) from error
+
+
+def check_arrays(checkpoint: Checkpoint, own_checkpoint: Checkpoint) -> None:
+    """Raises ValueError for arrays of other shapes or kinds than those that a run saves.
+
+    The digest in a file's name says that it is as it was written, not by whom.
+
+    Args:
+      checkpoint: what was read.
+      own_checkpoint: of the run that is to go on; its tables may have other rows.
+    """
+    num_runs = len(own_checkpoint.record["updates"])
+    wanted_arrays = _named_arrays(own_checkpoint)
+    for name, array in _named_arrays(checkpoint).items():
+        if "." in name:  # a column of a table: a number an evaluation or update, or one a run
+            table_name = name.partition(".")[0]
+            shape = (_num_rows(checkpoint, table_name), *(num_runs,) * (array.ndim > 1))
+            wanted_arrays[name] = np.empty(shape, array.dtype)
+    for name, wanted_array in wanted_arrays.items():
+        array = _named_arrays(checkpoint).get(name)
+        if array is None or _form(array) != _form(wanted_array):
+            words = "missing" if array is None else f"{array.dtype}{list(array.shape)}"
+            raise ValueError(
+                f"checkpoint {checkpoint.number} does not fit its run: {name} is {words}, and must "
+                f"be {wanted_array.dtype}{list(wanted_array.shape)}; remove it to go on from the "
+                "one before"
+            )
+
+
+def _named_arrays(checkpoint: Checkpoint) -> Arrays:
+    """Returns the arrays of a checkpoint by their names, without the states'."""
+    return {**checkpoint.record, "best": checkpoint.best}
+
+
+def _num_rows(checkpoint: Checkpoint, table_name: str) -> int:
+    """Returns the rows of the first column of a table."""
+    columns = (x for name, x in checkpoint.record.items() if name.startswith(f"{table_name}."))
+    return len(np.atleast_1d(next(columns)))
+
+
+def _form(array: np.ndarray) -> tuple[tuple[int, ...], str]:
+    """Returns the shape and the kind of an array's numbers; whether of 32 or 64 bits may differ."""
+    return array.shape, array.dtype.kind
 
 
 def newest_checkpoint(config: Config, say: Callable[[str], None]) -> Checkpoint | None:

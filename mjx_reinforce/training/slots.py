@@ -343,27 +343,27 @@ def compile_slots(programs: Programs, config: Config, width: int) -> Compiled:
     check_room(2.0 * width * row_bytes)  # the states before a block of updates, and after it
     rows, occupied = division.put((np.zeros((width, row_bytes), np.uint8), np.zeros(width, bool)))
     no_budget, no_evaluation = division.put((tuple(Budget.of(0, 0)), np.bool_(False)), NONE)
-    # XLA compiles without Python's lock: while one program compiles in a thread, the next one is
-    # traced here.
     # C MuJoCo takes nearly all the time of its programs, however well XLA compiles the rest. At
     # XLA's own level a quadruped's took 28 s on two cores, not 7 s, and played no faster.
     cpu_level = 0 if programs.calls_c else None
-    begin_task = started(functools.partial(_compile_begin, programs, width, cpu_level))
-    evaluate_jit = division.jit(programs.evaluate, (RUNS, RUNS), RUNS)
-    evaluate_lowered = evaluate_jit.lower(rows, occupied)
-    evaluate_task = started(functools.partial(executable, evaluate_lowered, cpu_level))
+    # XLA compiles without Python's lock: while one program compiles in a thread, the next one is
+    # traced here. Updates compile the longest, and so come first.
     advance_jit = division.jit(
-        programs.advance, (RUNS, NONE, RUNS, NONE), (RUNS, SECOND, RUNS), by_episodes=True
+        programs.kept("advance"), (RUNS, NONE, RUNS, NONE), (RUNS, SECOND, RUNS), by_episodes=True
     )
     advance_lowered = advance_jit.lower(rows, no_budget, occupied, no_evaluation)
     advance_task = started(functools.partial(executable, advance_lowered, cpu_level))
+    evaluate_jit = division.jit(programs.kept("evaluate"), (RUNS, RUNS), RUNS)
+    evaluate_lowered = evaluate_jit.lower(rows, occupied)
+    evaluate_task = started(functools.partial(executable, evaluate_lowered, cpu_level))
+    begin = _compile_begin(programs, width, cpu_level)
     advance = advance_task.result()
     evaluate = evaluate_task.result()
     check_fits(advance)
     check_fits(evaluate)
     # Without a run: a GPU's driver translates the kernels of a program when it first runs.
     jax.block_until_ready(advance(rows, no_budget, occupied, no_evaluation))
-    return Compiled(begin_task.result(), advance, evaluate, width, programs, config)
+    return Compiled(begin, advance, evaluate, width, programs, config)
 
 
 def _compile_begin(programs: Programs, width: int, cpu_level: int | None) -> Callable[..., Any]:
@@ -372,7 +372,7 @@ def _compile_begin(programs: Programs, width: int, cpu_level: int | None) -> Cal
     seed = division.shapes(jax.ShapeDtypeStruct((), np.uint32), NONE)
     seed_numbers = division.shapes(jax.ShapeDtypeStruct((width,), np.uint32), RUNS)
     settings = division.shapes(shape_of_all(programs.like, width).settings, RUNS)
-    program = division.jit(programs.begin, (NONE, RUNS, RUNS), (RUNS, SECOND))
+    program = division.jit(programs.kept("begin"), (NONE, RUNS, RUNS), (RUNS, SECOND))
     return executable(program.lower(seed, seed_numbers, settings), cpu_level)
 
 

@@ -53,6 +53,15 @@ def test_c_mujoco_stands_beside_its_own_precision_of_the_same_call():
     assert "4.0 (Hopper) to 4.0 (Hopper) times as fast as C MuJoCo in float64" in sentence
 
 
+def test_few_episodes_have_calls_of_their_own():
+    """The last call of few episodes stands beside an earlier one of many."""
+    few = GPU | {"date": "2026-11-24T14:00:00", "batch": 1, "env_steps_per_second": [5e3]}
+    raw = tables.last_calls([GPU, few, few | {"engine": "MuJoCo Warp"}])
+    assert [row["batch"] for row in raw.gpu] == [512, 1, 1]
+    assert "| Hopper-v5 | 1 | 0.2 | 0.2 | 1.0 |" in tables.latency(raw)
+    assert tables.rate(tables.best(raw.gpu, "Hopper-v5", "native")) == "2.00e6"
+
+
 def test_peers_say_their_precision_and_settings():
     candidate = c_mujoco("InvertedPendulum-v5", batch=2, steps=1)
     candidate.run()

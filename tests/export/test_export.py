@@ -6,35 +6,12 @@ import sys
 
 import numpy as np
 import pytest
-from saved_runs import change_env, make_run
+from exports import BOX, CASES, KERNEL, OBSERVATIONS, make, run_export
+from saved_runs import change_arrays, change_env, make_run
 
 from mjx_reinforce import load
-from mjx_reinforce.export import __main__ as export
 from mjx_reinforce.export.arithmetic import HEADS
 from mjx_reinforce.registry import DISTRIBUTIONS
-
-#: Far from the mean too: scaled observations are clipped, tanh units saturate.
-OBSERVATIONS = np.random.default_rng(0).normal(size=(200, 4)) * np.geomspace(0.1, 50, 200)[:, None]
-BOX = {"action_low": [-3.0, -1.0, 0.5], "action_high": [3.0, -0.5, 2.0]}
-
-#: Settings of the policy besides its family and actions, and how many observations are counted.
-CASES = {
-    "mlp": ({}, 50.0),
-    "linear": ({"hidden_sizes": []}, 50.0),
-    "one layer, not normalized": ({"hidden_sizes": [8]}, 0.0),
-    "not rescaled": ({"rescale": False}, 50.0),
-}
-
-
-def make(tmp_path, family, settings, count):
-    if family == "categorical":
-        return make_run(tmp_path, "CartPole-v1", count=count, **settings)
-    return make_run(tmp_path, "InvertedPendulum-v5", policy=family, count=count, **BOX, **settings)
-
-
-def run_export(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["export", *map(str, arguments)])
-    export.main()
 
 
 def import_file(path):
@@ -49,7 +26,7 @@ def import_file(path):
     [*((x, "linear") for x in DISTRIBUTIONS), *(("normal", x) for x in CASES if x != "linear")],
 )
 def test_the_exported_policy_acts_as_ours(tmp_path, monkeypatch, capsys, family, case):
-    run = make(tmp_path, family, *CASES[case])
+    run = make(tmp_path, family, case)
     run_export(monkeypatch, run)
     written = [run / name for name in ("seed_1.npz", "seed_1.py")]
     assert capsys.readouterr().out.split() == list(map(str, written))
@@ -58,7 +35,7 @@ def test_the_exported_policy_acts_as_ours(tmp_path, monkeypatch, capsys, family,
     assert module.SEED == 1
     expected = player.act(OBSERVATIONS)
     actions = module.act(OBSERVATIONS)
-    assert ("are clipped to" in module.__doc__) == (HEADS[family] == "clip")
+    assert ("are clipped to" in module.__doc__) == (family != "categorical")
     assert actions.shape == expected.shape
     if family == "categorical":
         np.testing.assert_array_equal(actions, expected)
@@ -75,6 +52,19 @@ def test_the_exported_policy_acts_as_ours(tmp_path, monkeypatch, capsys, family,
 
 def test_every_family_can_be_exported():
     assert set(HEADS) == set(DISTRIBUTIONS)
+
+
+def test_a_rounded_tanh_stays_within_the_range(tmp_path, monkeypatch):
+    """Of these ranges, the sum of the middle and half the range is beyond many an end."""
+    low, high = np.sort(np.random.default_rng(0).uniform(-3, 3, size=(2, 50)), axis=0)
+    space = {"action_low": [*low], "action_high": [*high], "hidden_sizes": []}
+    run = make_run(tmp_path, "InvertedPendulum-v5", policy="tanh-normal", **space)
+    change_arrays(run, **{KERNEL: lambda x: 100 * x})
+    run_export(monkeypatch, run)
+    actions = import_file(run / "seed_1.py").act(OBSERVATIONS)
+    low, high = low.astype(np.float32), high.astype(np.float32)
+    assert np.all((low <= actions) & (actions <= high))
+    np.testing.assert_allclose([actions.min(axis=0), actions.max(axis=0)], [low, high], rtol=1e-6)
 
 
 def test_unbounded_actions(tmp_path, monkeypatch):
@@ -123,7 +113,7 @@ def test_a_policy_of_the_package_can_be_exported(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--output", "policy.onnx"], "--output must end in .npz, got policy.onnx"),
+        (["--output", "policy.onnx"], "--output must end in .npz or .h, got policy.onnx"),
         (["--output", "my-policy.npz"], "cannot import 'my-policy.py'"),
         (["--output", "class.npz"], "cannot import 'class.py'"),
         (["--output", "numpy.npz"], "cannot import 'numpy.py' beside"),

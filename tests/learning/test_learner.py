@@ -262,7 +262,10 @@ def test_episodes_are_cut_until_a_share_of_the_budget_is_used(monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"horizon": 0}, "horizon must be at least one"),
+        ({"horizon": 0}, "horizon must be at least 1, got 0"),
+        ({"horizon": 10**12}, r"horizon must be less than 2\^31, got 1000000000000"),
+        ({"num_episodes": 2**31}, r"num_episodes must be less than 2\^31, got 2147483648"),
+        ({"num_episodes": 2**16, "horizon": 2**16}, "an update may have 4,294,967,296 env steps"),
         ({"estimator": lambda used: estimators.reward_to_go()}, "estimator must be of type"),
         ({"optimizer": jax.nn.relu}, "optimizer must be of type GradientTransformation"),
     ],

@@ -17,6 +17,7 @@ from mjx_reinforce.engine import devices
 from mjx_reinforce.engine.base import action_space
 from mjx_reinforce.engine.memory import gigabytes
 from mjx_reinforce.engine.play import choice
+from mjx_reinforce.learning.policy import MLP
 from mjx_reinforce.runs import command_line, plan
 from mjx_reinforce.runs.design import Design, check_design
 from mjx_reinforce.settings.config import Config
@@ -130,6 +131,13 @@ def test_a_network_of_python_that_does_not_fit_into_memory_is_refused(monkeypatc
     policy = mr.mlp_policy(1, mr.normal(action_space(env)), (1_000_000, 1_000_000))
     with pytest.raises(ValueError, match=r"it needs about 12,000 GB"):
         mr.reinforce(env, policy=policy, horizon=8)
+    search = mr.mlp_policy(1, mr.deterministic(action_space(env)), (1_000_000, 1_000_000))
+    with pytest.raises(ValueError, match=r"it needs about 8,000 GB"):
+        mr.ars(env, policy=search, horizon=8)
+    network = MLP((1_000_000, 1_000_000), num_outputs=1)
+    estimator = mr.value_baseline(horizon=8, network=network)  # and Adam's two moments
+    with pytest.raises(ValueError, match=r"it needs about 24,000 GB"):
+        mr.reinforce(env, estimator=estimator, horizon=8)
 
 
 def test_an_update_of_more_steps_than_are_counted_is_refused():

@@ -326,6 +326,46 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
     assert run("--resume parts --learning-rate 0.5") == 2
 
 
+OTHER_PARTS = {
+    "eval_return": (lambda x: x[:, :1], ", 1], not float32["),
+    "env_steps": (None, "env_steps is missing"),
+    "seed": (lambda x: x + 1, "seed is that of other runs"),
+    "configuration": (lambda x: x.astype(float), "configuration is float64[4], not int32[4]"),
+    "ends/seed": (lambda x: x[1:], "its ends are not of as many runs as their policies"),
+    "ends/normalizer/mean": (lambda x: x[..., :0], "and the settings of the policy make it"),
+}
+
+
+@pytest.mark.slow
+def test_a_part_of_other_runs_is_named_before_anything_is_trained(run, monkeypatch, capsys):
+    monkeypatch.setattr(plan, "_CPU_EPISODES", 16)
+
+    def crash_after_chunk(*arguments):
+        add(*arguments)
+        raise CrashError
+
+    add = SweepFiles._write_part
+    with monkeypatch.context() as patch:
+        patch.setattr(SweepFiles, "_write_part", crash_after_chunk)
+        with pytest.raises(CrashError):
+            run(f"{CHUNKS} --output parts")
+    (part,) = Path("parts/parts").glob("[0-9]*.npz")
+    with np.load(part) as archive:
+        arrays = dict(archive)
+    monkeypatch.setattr(driver.Driver, "drive", lambda *_: pytest.fail("it is trained"))
+    for name, (change, said) in OTHER_PARTS.items():
+        others = {key: x for key, x in arrays.items() if key != name}
+        if change is not None:
+            others[name] = change(arrays[name])
+        np.savez(part, **others)
+        capsys.readouterr()
+        assert run("--resume parts") == 2
+        error = capsys.readouterr().err
+        assert f"{part} is damaged: " in error
+        assert said in error
+        assert error.count("\n") == 1
+
+
 @pytest.mark.slow
 def test_a_chunk_that_goes_on_saves_when_it_is_due(run, monkeypatch):
     """Not at its first look: the checkpoint that it was found in counts."""

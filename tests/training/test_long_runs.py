@@ -13,6 +13,7 @@ import mjx_reinforce as mr
 from mjx_reinforce.engine.base import Trajectory
 from mjx_reinforce.learning import counts, normalize, schedules, value
 from mjx_reinforce.learning.updates import Clock
+from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.training.driver import RunDriver
 
 SMALL = ["--env", "Survive-v0", "--num-seeds", "1", "--num-episodes", "4", "--eval-episodes", "2"]
@@ -74,6 +75,39 @@ def test_a_run_passes_2_to_31_and_goes_on_there(run, tmp_path, monkeypatch):
     assert counted[-1] == last["env_steps"][0]
     with np.load(tmp_path / "out" / "returns.npz") as returns:
         assert any(returns[name].max() == counted[-1] for name in returns.files)
+
+
+@pytest.mark.parametrize("length", [2**31, 10**12])
+def test_the_scale_may_be_of_as_many_steps_as_a_run(length):
+    """A whole number beyond 2^31 ended in an OverflowError, and --normalize-steps took none."""
+    check(Config(normalize_steps=length))
+    for learner in (
+        mr.reinforce(Survive(), num_episodes=4, horizon=8, engine="vmap", normalize_steps=length),
+        mr.ars(Survive(), num_directions=2, horizon=8, engine="vmap", normalize_steps=length),
+    ):
+        state = learner.init(jax.random.key(0))
+        for _ in range(2):
+            before = float(state.actor.normalizer.count)
+            state, metrics = mr.train_step(learner, state)
+            after = float(state.actor.normalizer.count)
+            assert after - before == int(metrics["env_steps"]) > 0
+
+
+def test_counts_of_an_update_are_less_than_2_to_31():
+    """From Python, too, where they ended in errors of JAX and XLA."""
+    learner = mr.reinforce(Survive(), num_episodes=4, horizon=8, engine="vmap")
+    actor = learner.init(jax.random.key(0)).actor
+    for episodes, horizon in ((10**12, 8), (4, 10**12)):
+        with pytest.raises(ValueError, match=r"must be less than 2\^31, got 1000000000000"):
+            mr.evaluate(
+                *(Survive(), learner, actor, jax.random.key(1)),
+                num_episodes=episodes,
+                horizon=horizon,
+            )
+    with pytest.raises(ValueError, match=r"num_directions must be less than 2\^31"):
+        mr.ars(Survive(), num_directions=2**31, horizon=8)
+    with pytest.raises(ValueError, match="an update may have 4,294,967,296 env steps"):
+        mr.ars(Survive(), num_directions=2**15, horizon=2**16)
 
 
 @pytest.mark.parametrize("batch", [7, 9])

@@ -117,6 +117,46 @@ def test_a_checkpoint_that_is_cut_or_compressed_is_none(trained, tmp_path):
         assert resume._read(tmp_path / newest.name) is None
 
 
+OTHER_ARRAYS = {
+    "states": lambda x: x[:1],
+    "best": lambda x: x[:, :-4],
+    "record/updates": lambda x: x[:1],
+    "record/env_steps": None,
+    "record/returns": None,
+    "record/seen": lambda x: x.astype(float),
+    "record/training.env_steps": lambda x: x[:, :1],
+    "record/evaluations.seconds": lambda x: x[1:],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", OTHER_ARRAYS)
+def test_a_checkpoint_of_other_shapes_is_named(run, parts, capsys, name):
+    """Also where its name has the digest: no error of NumPy, and no table is cut."""
+    *_, newest = checkpoints(parts)
+    with np.load(newest) as archive:
+        arrays = dict(archive)
+    change = OTHER_ARRAYS[name]
+    if change is None:
+        del arrays[name]
+    else:
+        arrays[name] = change(arrays[name])
+    newest.unlink()
+    packed = io.BytesIO()
+    np.savez(packed, **arrays)
+    start = newest.name.rpartition("-")[0]
+    (newest.parent / f"{start}-{resume._digest(packed.getvalue())}.npz").write_bytes(
+        packed.getvalue()
+    )
+    before = (parts / "metrics.csv").read_bytes()
+    assert run("--resume", "parts") == 2
+    said = capsys.readouterr().err
+    assert "checkpoint" in said
+    assert "fit" in said
+    assert said.count("\n") == 1
+    assert (parts / "metrics.csv").read_bytes() == before
+
+
 @pytest.mark.slow
 def test_a_full_disk_costs_no_training(run, trained, tmp_path, monkeypatch, capsys):
     """Neither checkpoints nor policies nor rows can be written, then all of them again."""

@@ -29,7 +29,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Literal, NamedTuple
 
@@ -46,8 +46,7 @@ class Sizes(NamedTuple):
     of 200 env steps, left too little of 80 GB.
 
     batch, steps: of native's episodes
-    few: native is timed with so many episodes too, and MuJoCo Warp with so many worlds; of few
-      episodes the rows tell how long an env step takes
+    few: native is timed with so many episodes too, and MuJoCo Warp with so many worlds
     mjx: the episodes of plain MJX, each number that is tried
     mjx_steps: their env steps
     warp: the worlds of MuJoCo Warp, each number that is tried
@@ -78,7 +77,7 @@ GPU = {
     "Swimmer-v5": Sizes(135_168, 200, (8_192,), 20, (32_768, 131_072)),
     "InvertedDoublePendulum-v5": Sizes(135_168, 200, (4_096,), 20, (32_768, 131_072)),
     "CartPole-v1": Sizes(262_144, 200, warp=()),
-    "Humanoid-v5": Sizes(33_792, 100, few=(1, 32, 256, 2_048)),
+    "Humanoid-v5": Sizes(33_792, 100, few=(2_048,)),
     "HumanoidStandup-v5": Sizes(33_792, 100, few=(2_048,)),
     QUADRUPED: OTHER,
     ELLIPTIC: OTHER,
@@ -113,6 +112,9 @@ class Settings:
     """All of the part if not given: ids, with settings after them, "ID NAME=VALUE"."""
     runs: tuple[Path, ...] = ()
     """Run directories whose best policies play on a GPU, too, each in the task of its training."""
+    batches: tuple[int, ...] = ()
+    """On a GPU, episodes of native and worlds of MuJoCo Warp, each number in turn; the task's own
+    numbers if not given. With few of them the rows tell how long an env step takes."""
     shrink: int = 1
     """Divide episodes and worlds by this, to try the script; such rows are worth nothing."""
     worker: str = ""
@@ -183,6 +185,8 @@ def start(task: str, index: int, date: str, settings: Settings) -> subprocess.Po
         command.append(f"--{name}={getattr(settings, name)}")
     runs = [str(run) for run in settings.runs if task_of(run) == task]
     command += ["--runs", *runs] if runs else []
+    if settings.batches:
+        command += ["--batches", *map(str, settings.batches)]
     environment = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     if settings.part == "cpu":
         environment["JAX_PLATFORMS"] = "cpu"
@@ -234,10 +238,8 @@ def work(settings: Settings) -> None:
 
     jax.config.update("jax_default_matmul_precision", "highest")
     (task,) = settings.tasks
-    if settings.part == "gpu":
-        candidates = on_gpu(task, settings.shrink, settings.runs)
-    else:
-        candidates = on_cpu(task, settings.shrink)
+    candidates_of = on_gpu if settings.part == "gpu" else on_cpu
+    candidates = candidates_of(task, settings)
     print("compiled", flush=True)
     if sys.stdin.readline().strip() != "go":
         return
@@ -270,42 +272,45 @@ def added(task: str, worlds: int) -> list[Candidate]:
     return [candidate]
 
 
-def on_gpu(task: str, shrink: int, runs: Sequence[Path]) -> Callable[[], list[Candidate]]:
+def on_gpu(task: str, settings: Settings) -> Callable[[], list[Candidate]]:
     """Native, plain MJX, C MuJoCo and MuJoCo Warp; records wait, for all tasks share the GPU."""
     from experiments.speed.benchmark.ours import rollout_of, rollouts
     from experiments.speed.benchmark.peers import c_mujoco
 
     sizes = GPU.get(task, OTHER)
+    if settings.batches:
+        sizes = Sizes(settings.batches[-1], sizes.steps, warp=(), few=settings.batches[:-1])
     native = []
-    for run in (None, *runs):
+    for run in (None, *settings.runs):
         try:
             native.append(rollout_of(task, "native", sizes.steps, run=run))
         except ValueError as error:  # what native refuses, peers may play
             print(f"{task}: {error}", file=sys.stderr, flush=True)
     for rollout in native:
         rollout(128).run()  # the machine code is the same for any number of episodes
-    plain = [batch // shrink for batch in sizes.mjx]
+    plain = [batch // settings.shrink for batch in sizes.mjx]
     others = rollouts(task, "plain MJX", plain, sizes.mjx_steps) if plain else []
-    if sizes.warp:
+    worlds = settings.batches or (*sizes.few, *sizes.warp)
+    if worlds:
         others.append(c_mujoco(task))
         added(task, 128)  # compiles
 
     def candidates() -> list[Candidate]:
-        batches = [max(1, batch // shrink) for batch in (*sizes.few, sizes.batch)]
-        worlds = [max(1, number // shrink) for number in (*sizes.few, *sizes.warp)]
+        batches = [max(1, batch // settings.shrink) for batch in (*sizes.few, sizes.batch)]
         ours = [rollout(batch) for rollout in native for batch in batches]
-        return sum((added(task, number) for number in worlds), ours + others)
+        numbers = [max(1, number // settings.shrink) for number in worlds]
+        return sum((added(task, number) for number in numbers), ours + others)
 
     return candidates
 
 
-def on_cpu(task: str, shrink: int) -> Callable[[], list[Candidate]]:
+def on_cpu(task: str, settings: Settings) -> Callable[[], list[Candidate]]:
     """Native in both precisions beside C MuJoCo and Gymnasium, on the threads of this process."""
     from experiments.speed.benchmark.ours import rollouts
     from experiments.speed.benchmark.peers import peers
 
     batch, steps = CPU[task]
-    batches = [batch // shrink]
+    batches = [batch // settings.shrink]
     candidates = rollouts(task, "native", batches, steps)
     candidates += rollouts(task, "native", batches, steps, "float64")
     if task == SHOWN_ON_CPU:

@@ -15,6 +15,7 @@ from experiments.speed.benchmark.robots import make
 from experiments.speed.benchmark.rows import TRAINED, UNTRAINED, Candidate
 from mjx_reinforce import Actor, Policy, act, categorical, load, mlp_policy, normal
 from mjx_reinforce.engine.base import Discrete, action_space, observation_size
+from mjx_reinforce.engine.devices import executable
 from mjx_reinforce.engine.play.choice import ActingPolicy, choose
 from mjx_reinforce.learning import normalize
 
@@ -121,7 +122,7 @@ def compiled(
 ) -> Candidate:
     """Compiles ``fn(argument, key)``, and notes how long that and what came before took (s)."""
     started = time.perf_counter()
-    program = jax.jit(fn).lower(argument, jax.random.key(0)).compile()
+    program = executable(jax.jit(fn).lower(argument, jax.random.key(0)))
     row["compile_seconds"] = before + time.perf_counter() - started
     row["device"] = jax.devices()[0].device_kind
     keys = iter(jax.random.split(jax.random.key(1), 1000))

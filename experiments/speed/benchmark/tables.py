@@ -38,10 +38,17 @@ class Raw(NamedTuple):
 
 
 def last_calls(rows: list[dict[str, Any]]) -> Raw:
-    """Sorts rows by the kind of their call, and keeps each task's last call of a kind."""
+    """Sorts rows by the kind of their call, and keeps each task's last call of a kind.
+
+    Few episodes have calls of their own (``--batches``), and so a last one.
+    """
     on_gpu = {row["date"] for row in rows if row["device"] != "cpu"}
-    last = {(row["task"], row["date"] in on_gpu): row["date"] for row in sorted(rows, key=_date)}
-    now = [row for row in rows if row["date"] == last[row["task"], row["date"] in on_gpu]]
+
+    def kind(row: dict[str, Any]) -> tuple[str, bool, bool]:
+        return row["task"], row["date"] in on_gpu, row["batch"] in SMALL
+
+    last = {kind(row): row["date"] for row in sorted(rows, key=_date)}
+    now = [row for row in rows if row["date"] == last[kind(row)]]
     gpu, cpu = ([row for row in now if (row["date"] in on_gpu) == it] for it in (True, False))
     return Raw(gpu, cpu)
 

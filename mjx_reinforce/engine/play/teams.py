@@ -23,7 +23,7 @@ def why_not(env: Any) -> str | None:
         return f"a thread plays a model of fewer than {_LEAST_DOFS} degrees of freedom faster"
     from mjx_reinforce.engine.team import tables  # imports MuJoCo
 
-    return tables.why(model.mj_model)
+    return tables.why(model.mj_model, model.random)
 
 
 def played_by(env: Any) -> str:
@@ -54,8 +54,8 @@ def team_physics(model: PhysicsModel) -> Physics:
     # of many warps have, and as many states do not fit into shared memory.
     has_room = model.mj_model.nv < lanes
     return Physics(
-        text=tables.physics_text(model.mj_model),
-        far=tables.far_words(model.mj_model),
+        text=tables.physics_text(model.mj_model, random=model.random),
+        far=tables.far_words(model.mj_model, random=model.random),
         skip=model.frame_skip,
         lanes=lanes,
         shared=_shared_memory(),

@@ -1,6 +1,7 @@
 """A model without the parts of the physics that its flags disable."""
 
 import copy
+import itertools
 from typing import Any
 
 import mujoco
@@ -65,9 +66,19 @@ def without_disabled(mj_model: MjModel) -> Any:
     if is_off(model, "spring") and is_off(model, "damper"):
         model.body_gravcomp[:] = 0
         model.opt.density = model.opt.viscosity = 0
+    for field in _FORCES:
+        getattr(model, field)[disabled_actuators(model)] = 0
+    return model
+
+
+def disabled_fields(model: Any) -> frozenset[str]:
+    """Returns the fields of terms that the flags of a model disable."""
+    disabled_terms = [fields for flag, fields in _TERMS.items() if is_off(model, flag)]
+    return frozenset(itertools.chain(*disabled_terms))
+
+
+def disabled_actuators(model: Any) -> np.ndarray:
+    """Returns which actuators are of a group that is disabled (mj_actuatorDisabled)."""
     groups = np.clip(model.actuator_group, -1, _MAX_GROUPS)
     disabled_groups = (model.opt.disableactuator >> np.arange(_MAX_GROUPS) & 1).astype(bool)
-    is_disabled = np.append(disabled_groups, [False, False])[groups]  # mj_actuatorDisabled
-    for field in _FORCES:
-        getattr(model, field)[is_disabled] = 0
-    return model
+    return np.append(disabled_groups, [False, False])[groups]

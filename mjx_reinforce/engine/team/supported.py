@@ -1,6 +1,7 @@
 """What teams of lanes play: which models of MuJoCo the device code covers."""
 
-from collections.abc import Iterable
+import itertools
+from collections.abc import Collection, Iterable
 from typing import Any, NamedTuple
 
 import mujoco
@@ -55,13 +56,24 @@ class GeomPair(NamedTuple):
     pair: int
 
 
-def why(mj_model: MjModel) -> str | None:
-    """Returns in one line why teams cannot play a model, or None if they can."""
+def why(mj_model: MjModel, random: Collection[str] = ()) -> str | None:
+    """Returns in one line why teams cannot play a model, or None if they can.
+
+    Args:
+      mj_model: the model.
+      random: the names of its fields that differ from episode to episode.
+    """
     model = flags.without_disabled(mj_model)
-    for features in (_lacking_options, _lacking_parts, _lacking_actuators, _lacking_contacts):
-        for feature, has_feature in features(model):
-            if has_feature:
-                return f"the model has {feature}, which teams of lanes do not play"
+    features = itertools.chain(
+        _lacking_options(model),
+        _lacking_parts(model),
+        _lacking_actuators(model),
+        _lacking_draws(model, random),
+        _lacking_contacts(model),
+    )
+    for feature, has_feature in features:
+        if has_feature:
+            return f"the model has {feature}, which teams of lanes do not play"
     return None
 
 
@@ -132,6 +144,25 @@ def _lacking_actuators(model: Any) -> Iterable[tuple[str, Any]]:
     yield "activations of actuators", model.na
     yield "delays of actuators", np.any(model.actuator_delay)
     yield "actuators of several controls", np.any(model.actuator_ctrlnum != 1)
+
+
+def _lacking_draws(model: Any, random: Collection[str]) -> Iterable[tuple[str, Any]]:
+    """Yields what of random fields the device code lacks, and whether a model has it."""
+    types = _C.mjtTrn
+    kinds = model.actuator_trntype
+    of_joints = np.isin(kinds, (types.mjTRN_JOINT, types.mjTRN_JOINTINPARENT))
+    joint_kinds = model.jnt_type[np.where(of_joints, model.actuator_trnid[:, 0], 0)]
+    # Their gear is in the parts of a cable.
+    is_wrench = (kinds == types.mjTRN_SITE) | (of_joints & (joint_kinds <= BALL))
+    has_gear = "actuator_gear" in random
+    yield "random gears of actuators of sites, balls or free joints", has_gear and is_wrench.any()
+    inherited = (model.actuator_armature, model.actuator_damping, model.actuator_dampingpoly)
+    adds = any(np.any(x) for x in inherited)
+    yield "random gears of actuators with armature or damping", has_gear and adds
+    # One of them may be a servo.
+    has_gains = {"actuator_gainprm", "actuator_biasprm"}.intersection(random)
+    of_balls = of_joints & (joint_kinds == BALL)
+    yield "random gains of actuators of ball joints", has_gains and of_balls.any()
 
 
 def _lacking_contacts(model: Any) -> Iterable[tuple[str, Any]]:

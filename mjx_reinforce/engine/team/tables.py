@@ -5,10 +5,11 @@ the joint's anchor. A body without a joint belongs to the link that carries it: 
 anchors have fixed places in the frames of links.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import mujoco
 import numpy as np
 
@@ -16,7 +17,7 @@ from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.physics import sensors
 from mjx_reinforce.engine.physics.early_stop import stops_early
 from mjx_reinforce.engine.scalar import UnsupportedPrimitive
-from mjx_reinforce.engine.team import cables, flags, last_pass, records, supported
+from mjx_reinforce.engine.team import cables, draws, flags, last_pass, records, supported
 from mjx_reinforce.engine.team.contact_kinds import (
     MIN_VALUE,
     ContactKind,
@@ -49,6 +50,7 @@ _HEADERS = [
     "kinematics",
     "impedance",
     "bounds",
+    "draws",
     "cones",
     "cables",
     "passive",
@@ -79,17 +81,18 @@ _GEOM_KINDS = {PLANE: 0, SPHERE: 1, CAPSULE: 1, BOX: 2, CYLINDER: 3, ELLIPSOID: 
 _NO_LIMIT = 1e30
 
 
-def physics_text(mj_model: MjModel, num_near: int = NUM_NEAR) -> str:
+def physics_text(mj_model: MjModel, num_near: int = NUM_NEAR, random: Collection[str] = ()) -> str:
     """Returns the device code for a model.
 
     Args:
       mj_model: the model.
       num_near: contacts that the state of a team has room for.
+      random: the names of its fields that differ from episode to episode.
 
     Raises:
       UnsupportedPrimitive: the device code lacks something that the model has; see ``why``.
     """
-    if reason := why(mj_model):
+    if reason := why(mj_model, random):
         raise UnsupportedPrimitive(reason)
     device = Path(__file__).parent / "device"
     prelude, headers = (
@@ -97,16 +100,31 @@ def physics_text(mj_model: MjModel, num_near: int = NUM_NEAR) -> str:
         for names in (_PRELUDE, _HEADERS)
     )
     # One text, as NVRTC has no folders: nothing is included, and no file may come twice.
-    text = "\n".join([*prelude, _Tables(mj_model, num_near).text(), *headers])
+    text = "\n".join([*prelude, _Tables(mj_model, num_near, random).text(), *headers])
     return text.replace("#pragma once\n", "")
 
 
-def far_words(mj_model: MjModel, num_near: int = NUM_NEAR) -> int:
+def far_words(mj_model: MjModel, num_near: int = NUM_NEAR, random: Collection[str] = ()) -> int:
     """Returns how many 4-byte words of memory the contacts need that a team has no room for."""
-    sizes = _Tables(mj_model, num_near).constants
-    contact_words = 13 + 5 * sizes["CD"] + sizes["ELLIPTIC"]  # the Contact of state.h
+    sizes = _Tables(mj_model, num_near, random).constants
+    # The Contact of state.h.
+    contact_words = 13 + 5 * sizes["CD"] + sizes["ELLIPTIC"] + 5 * sizes["DRAWS_FRICTION"]
     words = max(0, int(sizes["NI"] - sizes["NEAR"])) * int(contact_words)
     return words + words % 2  # numbers of 8 bytes may follow
+
+
+def drawn_numbers(
+    mj_model: MjModel, random: Collection[str], fields: Mapping[str, Any]
+) -> jax.Array:
+    """Returns what an episode draws of the device code's tables [n], for ``draw`` of C++.
+
+    Args:
+      mj_model: the model.
+      random: the names of its fields that differ from episode to episode.
+      fields: these fields, and what MuJoCo derives of them, by their names in mjModel.
+    """
+    tables = _Tables(mj_model, NUM_NEAR, random)
+    return draws.numbers(draws.entries(tables, tables.random, fields))
 
 
 class _Tables:
@@ -116,12 +134,15 @@ class _Tables:
     functions: tables that the compiler knows, for loops that it writes out
     ints, masks, reals: the arrays of the struct Model, which the lanes read
     soft: the rows of the softnesses that were met, with their numbers
+    random: the names of fields that differ from episode to episode
+    layout: of the tables that such fields change
     """
 
-    def __init__(self, mj_model: MjModel, num_near: int):
+    def __init__(self, mj_model: MjModel, num_near: int, random: Collection[str]):
         """Makes them; see ``physics_text``."""
         model = flags.without_disabled(mj_model)
         self.model = model
+        self.random = draws.effective(model, random)
         self.constants: dict[str, int] = {}
         self.real_constants: dict[str, float] = {}
         self.functions: dict[str, Iterable[int]] = {}
@@ -156,6 +177,7 @@ class _Tables:
         self.constants["ANY_POWER"] = int(any(x.power != 2 for x in self.soft))
         self.reals["soft"] = list(self.soft)
         self.reals["gravity"] = model.opt.gravity
+        self.layout = draws.Layout(self, self.random)
 
     def text(self) -> str:
         """Returns the tables as C++."""
@@ -168,9 +190,16 @@ class _Tables:
             table = ", ".join(str(int(x)) for x in values) or "0"
             lines.append(f"DEV constexpr int {name}(int i) {{")
             lines.append(f"  constexpr int table[] = {{{table}}};\n  return table[i];\n}}")
-        lines.append("struct Model {")
+        lines.append("struct Fixed {")
         lines.append("  real timestep, smallest_gain;")
         empty = []
+        ints = self.ints
+        reals = {name: x for name, x in self.reals.items() if name not in self.layout.starts}
+        has_draws = bool(self.layout.places)
+        if has_draws:
+            ints = ints | {"drawn_place": self.layout.places}
+            reals["drawn_base"] = self.layout.base
+        names = ["timestep", "smallest_gain", *ints, *self.masks, *reals]
         # In float32 a step that lowers the cost by less is rounding; in float64 the search goes on
         # until no row changes. The cost of an elliptic cone that slides is not quadratic, and no
         # step is the last by itself: in float32 one of a tenth of C's tolerance is, in float64 one
@@ -182,9 +211,9 @@ class _Tables:
             f"SINGLE ? real({single * scale!r}) : real({double * scale!r})",
         ]
         for type_name, literal, arrays in (
-            ("int", lambda x: f"{int(x):d}", self.ints),
+            ("int", lambda x: f"{int(x):d}", ints),
             ("Mask", lambda x: f"{int(x):d}ull", self.masks),
-            ("real", lambda x: f"real({float(x)!r})", self.reals),
+            ("real", lambda x: f"real({float(x)!r})", reals),
         ):
             for name, values in arrays.items():
                 entries = np.asarray(values).ravel().tolist()
@@ -199,6 +228,7 @@ class _Tables:
         # C++ has no empty array: those that are share a place.
         lines += [f"  union {{ int none; {' '.join(empty)} }};", "};"]
         initial_values.append("{0}")
+        lines += draws.view(names, self.layout, records.STRUCTS) if has_draws else draws.NO_VIEW
         lines += records.checks()
         lines.append("#define MODEL_INIT {" + ",\\\n".join(initial_values) + "}")
         return "\n".join(lines)
@@ -228,7 +258,8 @@ class _Tables:
         # With the armature of an actuator, C solves once more (mj_EulerSkip): this only matters for
         # a search that stops early.
         solves_again = stops_early(self.model) and np.any(self.model.jnt_actuatorid != -1)
-        return int(is_euler and not is_off and (self.damping.any() or solves_again))
+        is_damped = self.damping.any() or "dof_damping" in self.random
+        return int(is_euler and not is_off and (is_damped or solves_again))
 
     def _records(self, name: str, order: Any = slice(None), **columns: np.ndarray) -> None:
         """Makes a table of structs from the columns of their fields, [rows] or [rows, numbers]."""
@@ -325,8 +356,14 @@ class _Tables:
         model = self.model
         masses = model.body_mass * model.body_gravcomp
         weights: dict[int, np.ndarray] = {}
-        for frame, mass, ipos in zip(self.frames, masses, model.body_ipos, strict=True):
-            if mass and frame.link >= 0:
+        is_held = model.body_gravcomp != 0
+        if "body_mass" not in self.random:
+            is_held &= model.body_mass != 0
+        for body in np.flatnonzero(is_held):
+            frame = self.frames[body]
+            mass = masses[body]
+            ipos = model.body_ipos[body]
+            if frame.link >= 0:
                 row = mass * np.array([*frame.place(ipos), 1])
                 weights[frame.link] = weights.get(frame.link, 0) + row
         self.ints["compensated_link"] = list(weights)
@@ -343,34 +380,24 @@ class _Tables:
         model = self.model
         opt = model.opt
         links = np.array([self._link_number(x.link) for x in self.frames])
-        bodies = np.flatnonzero((model.body_mass >= MIN_VALUE) & (links < model.njnt))
+        is_resisted = (model.body_mass >= MIN_VALUE) | ("body_mass" in self.random)
+        bodies = np.flatnonzero(is_resisted & (links < model.njnt))
         bodies = bodies[np.argsort(links[bodies], kind="stable")]
         has_medium = opt.density > 0 or opt.viscosity > 0
         self.constants["MEDIUM"] = int(has_medium)
+        self.fluid_bodies = bodies if has_medium else bodies[:0]
         self.ints["link_fluid"] = []
         self.reals |= {"fluid_body": [], "wind": []}
         if not has_medium:
             return
-        # A body is a box of the same inertia, or, where the medium is viscous, a ball.
-        inertia = model.body_inertia[bodies]
-        squares = inertia.sum(1, keepdims=True) - 2 * inertia
-        masses = model.body_mass[bodies, None]
-        box = np.sqrt(np.maximum(MIN_VALUE, squares) / masses * 6)
-        diameter = box.mean(1)
-        others = box[:, [[1, 2], [0, 2], [0, 1]]]
+        resistances = draws.fluid(np, model, bodies).values()
         turns = [
             rotation(self.frames[x].then(model.body_ipos[x], model.body_iquat[x]).quat).T
             for x in bodies
         ]
-        self._records(
-            "fluid_body",
-            at=np.array([self.frames[x].place(model.body_ipos[x]) for x in bodies]),
-            axes=np.array(turns),
-            viscous_torque=np.pi * opt.viscosity * diameter**3,
-            viscous_force=3 * np.pi * opt.viscosity * diameter,
-            drag_torque=opt.density / 64 * box * (others**4).sum(2),
-            drag_force=opt.density / 2 * others.prod(2),
-        )
+        places = [self.frames[x].place(model.body_ipos[x]) for x in bodies]
+        turns = np.reshape(turns, (-1, 9))
+        self.reals["fluid_body"] = np.hstack([np.array(places), turns, *resistances])
         self.ints["link_fluid"] = np.searchsorted(links[bodies], np.arange(model.njnt + 1))
         self.reals["wind"] = opt.wind
 
@@ -404,9 +431,10 @@ class _Tables:
         laws = np.column_stack([model.jnt_stiffness, model.jnt_stiffnesspoly])[joint]
         laws = np.hstack([laws, self.damping])
         laws[is_single, 0] = laws[:, 3] = 0
-        self.constants["JOINT_LAWS"] = int(laws.any())
-        self.reals["dof_law"] = laws if laws.any() else []
-        self.reals["rest"] = model.qpos_spring if laws.any() else []
+        has_laws = laws.any() or ("jnt_stiffness" in self.random and not is_single.all())
+        self.constants["JOINT_LAWS"] = int(has_laws)
+        self.reals["dof_law"] = laws if has_laws else []
+        self.reals["rest"] = model.qpos_spring if has_laws else []
         self.reals["dof_spring"] = model.qpos_spring[qpos]
         self.reals["dof_zero"] = model.qpos0[qpos]
         # Free bodies without others in their tree, which implicitfast turns in a way of its own.
@@ -534,6 +562,7 @@ class _Tables:
         # The moments of an actuator's own cable have its gear.
         gear[[x.actuator for x in self.cables if x.actuator >= 0]] = 1
         order = np.argsort(targets, kind="stable")
+        self.actuator_order = order
         no_range = (-_NO_LIMIT, _NO_LIMIT)
         controls = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, no_range)
         forces = np.where(model.actuator_forcelimited[:, None], model.actuator_forcerange, no_range)
@@ -634,13 +663,16 @@ class _Tables:
         pairs = [(pair, contact_kind(model, pair)) for pair in supported.meeting(model)]
         geoms = sorted({geom for pair, _ in pairs for geom in (pair.geom1, pair.geom2)})
         geom_ids = {geom: number for number, geom in enumerate(geoms)}
-        kind_numbers: dict[ContactKind, int] = {}
+        # Contacts whose friction an episode draws also have in common which geom's it is.
+        has_friction = "geom_friction" in self.random
+        kind_numbers: dict[tuple[ContactKind, int], int] = {}
         kind_pairs = 0
         items = []
         item_kinds = []
         weights = []
         for pair, kind in pairs:
-            number = kind_numbers.setdefault(kind, len(kind_numbers))
+            mix = draws.mix(model, pair) if has_friction else 0
+            number = kind_numbers.setdefault((kind, mix), len(kind_numbers))
             bodies = model.geom_bodyid[[pair.geom1, pair.geom2]]
             weight = sum(model.body_invweight0[body, 0] for body in bodies)
             if kind.dim > 1 and not self._is_elliptic():
@@ -655,8 +687,16 @@ class _Tables:
                 weights.append(weight)
         self.ints["item"] = items
         self.ints["item_kind"] = item_kinds
-        self.reals["item_weight"] = weights
-        kinds = list(kind_numbers)
+        has_weights = has_friction or bool(draws.INERTIAL.intersection(self.random))
+        self.constants["DRAWS_FRICTION"] = int(has_friction)
+        self.constants["DRAWS_WEIGHTS"] = int(has_weights)
+        self.real_constants["CONE_SCALE"] = float(max(model.opt.impratio, MIN_VALUE) ** -0.5)
+        self.reals["item_weight"] = [] if has_weights else weights
+        self.reals["body_weight"] = model.body_invweight0[:, 0] if has_weights else []
+        self.reals["geom_friction"] = model.geom_friction[geoms] if has_friction else []
+        self.ints["kind_mix"] = [mix for _, mix in kind_numbers] if has_friction else []
+        self.geoms = np.array(geoms, int)
+        kinds = [kind for kind, _ in kind_numbers]
         self.ints["kind_dim"] = [x.dim for x in kinds]
         self.ints["kind_soft"] = [self._number(x.softness) for x in kinds]
         self.reals["kind_margin"] = [x.margin for x in kinds]
@@ -673,7 +713,7 @@ class _Tables:
         self.constants["NEAR"] = max(1, min(num_near, len(items)))
         self.constants["CD"] = max((x.dim for x in kinds), default=1)
         self.constants["NG"] = max(len(geoms), 1)
-        self._geoms(np.array(geoms, int))
+        self._geoms(self.geoms)
 
     def _geoms(self, geoms: np.ndarray) -> None:
         """Makes the tables of the geoms that may meet."""

@@ -313,9 +313,13 @@ class CText(Cpp):
         is_sound = self.name()
         # Of all that the task may read, only this is a result, and not a field of the state.
         sources = {**_STATE, "sound": is_sound}
-        for field, scalars in zip(_INPUTS, call.args, strict=True):
+        for field, scalars in zip(_INPUTS, call.args, strict=False):
             if scalars:
                 self.fill(_STATE[field], scalars)
+        # Where fields of the model are random, what is drawn of them comes last.
+        for scalars in call.args[len(_INPUTS) :]:
+            if scalars:
+                self.line(f"draw(M, s, {self.array(scalars)}, lane);")
         if self._simulates_once:
             self._read_from(_STATE["ctrl"], call.args[0])  # which the physics leaves as it is
         simulate, meetings = _SIMULATIONS[call.name]

@@ -8,6 +8,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.engine import base, scalar
 from mjx_reinforce.engine.play import teams
 from mjx_reinforce.engine.scalar import jaxprs, scalarized
+from mjx_reinforce.envs.tasks.ant import Ant
 
 
 def traced_step(env):
@@ -34,6 +35,31 @@ def test_another_model_or_duration_has_another_name():
     slower = envs.make("InvertedPendulum-v5", frame_skip=4)
     double = envs.make("InvertedDoublePendulum-v5")
     assert len({env.physics_model().digest for env in (pendulum, slower, double)}) == 3
+
+
+class RandomAnt(Ant):
+    """Its torso's mass, and what else its class says, differ from episode to episode."""
+
+    fields = ("body_mass",)
+
+    def randomize(self, rng):
+        factor = jax.random.uniform(rng, minval=0.5, maxval=2)
+        return {name: factor * getattr(self.mj_model, name) for name in self.fields}
+
+
+class GearedAnt(RandomAnt):
+    fields = ("body_mass", "actuator_gear")
+
+
+def test_random_fields_are_part_of_a_model():
+    ant, random, geared = envs.make("Ant-v5"), RandomAnt(), GearedAnt()
+    assert ant.physics_model().random == ()
+    assert geared.physics_model().random == GearedAnt.fields
+    assert len({env.physics_model().digest for env in (ant, random, geared)}) == 3
+    assert [*scalar.simulated_models(traced_step(random))] == [random.physics_model().digest]
+    geared.mj_model.actuator_damping[0] = 1
+    reason = "the model has random gears of actuators with armature or damping, which teams of"
+    assert str(teams.why_not(geared)).startswith(reason)
 
 
 def test_an_environment_need_not_offer_a_model():

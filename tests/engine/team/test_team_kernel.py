@@ -15,6 +15,7 @@ from mjx_reinforce.engine.gpu import cubin, team_kernel
 from mjx_reinforce.engine.play import available, choice, native, program
 from mjx_reinforce.engine.play import teams as team
 from mjx_reinforce.engine.scalar import scalarized
+from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import MujocoEnv
 
 if reason := available.unavailable():
@@ -52,6 +53,42 @@ class Leg(MujocoEnv):
 
     def outcome(self, before, data, action):
         return jnp.sin(data.sensordata[0]), False, {}
+
+
+class RandomLeg(Leg):
+    """Its episodes have models of their own, which sensors show, too."""
+
+    def randomize(self, rng):
+        fields = {}
+        for key, name in zip(jax.random.split(rng, len(models.RANDOM)), models.RANDOM, strict=True):
+            field = jnp.asarray(getattr(self.mj_model, name))
+            fields[name] = field * jax.random.uniform(key, field.shape, minval=0.5, maxval=2)
+        fields["dof_damping"] = jnp.array([0.3, 0.01]) * jax.random.uniform(rng, (2,))
+        return fields | {"body_ipos": jnp.asarray(self.mj_model.body_ipos)}
+
+    def observe(self, data):
+        return jnp.concatenate([super().observe(data), data.episode["body_mass"]])
+
+
+class RememberingLeg(Leg):
+    """It acts late, is pushed every second step, and sees the last action and noise."""
+
+    def memory(self, rng, data):
+        return {"action": jnp.zeros(1), "noise": jax.random.normal(rng, (2,)), "step": 0}
+
+    def remember(self, rng, data, action):
+        noise = jax.random.normal(rng, (2,))
+        return {"action": action, "noise": noise, "step": data.memory["step"] + 1}
+
+    def actuate(self, before, action):
+        return before.memory["action"]
+
+    def push(self, before):
+        return jnp.where(before.memory["step"] % 2 == 1, 0.1, 0.0) * before.memory["noise"]
+
+    def observe(self, data):
+        memory = data.memory
+        return jnp.concatenate([super().observe(data), memory["action"], memory["noise"]])
 
 
 @pytest.fixture
@@ -102,6 +139,43 @@ def test_teams_show_sensors(teams):
         pair = (getattr(x, name)[:, :20] for x in (got, want))
         np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
     assert (want.observation[..., 9] > 0).any()  # touch
+
+
+@pytest.mark.slow
+def test_teams_play_models_that_differ_from_episode_to_episode(teams):
+    spec = mujoco.MjSpec.from_string(LEG)
+    env = RandomLeg(xml_file=spec, frame_skip=2, max_episode_steps=40, reward_threshold=None)
+    actor, act, distribution = actor_and_act(env, (5,))
+    want = played(native.native_rollout, env, (actor, act, distribution), num_seeds=2)
+    made = teams()
+    engine = choice.choose("auto", env, choice.ActingPolicy(act, actor, distribution), 40)
+    assert (engine.name, engine.why.partition(", ")[2]) == ("native", "16 lanes an episode")
+    got = played(engine.rollout, env, (actor, act, distribution), num_seeds=2)
+    assert {kernel.launch.lanes for kernel in made} == {16}
+    masses = want.observation[:, 0, :, -1].ravel()
+    assert len(np.unique(masses)) == masses.size == 10  # the episodes of a kernel
+    for name in ("observation", "reward"):
+        pair = (getattr(x, name)[:, :20] for x in (got, want))
+        np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
+
+
+@pytest.mark.slow
+def test_teams_play_episodes_that_remember(teams):
+    spec = mujoco.MjSpec.from_string(LEG)
+    env = RememberingLeg(xml_file=spec, frame_skip=2, max_episode_steps=40, reward_threshold=None)
+    player = actor_and_act(env, (5,))
+    want = played(native.native_rollout, env, player, num_seeds=2)
+    made = teams()
+    got = played(native.native_rollout, env, player, num_seeds=2)
+    assert {kernel.launch.lanes for kernel in made} == {16}
+    for name in ("observation", "reward"):
+        pair = (getattr(x, name)[:, :20] for x in (got, want))
+        np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
+    np.testing.assert_allclose(
+        want.observation[:, 1:20, :, -3], want.action[:, :19, :, 0], atol=1e-6
+    )
+    noise = want.observation[:, :20, :, -1]
+    assert len(np.unique(noise)) == noise.size  # of each seed, step and episode
 
 
 def test_a_table_with_infinity_is_not_static():

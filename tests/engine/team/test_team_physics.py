@@ -148,6 +148,23 @@ def test_lanes_in_any_order_play_alike(task, lanes, tmp_path):
 
 
 @needs_compiler
+@pytest.mark.parametrize("option", ["", 'iterations="2" ls_iterations="4"'])
+@pytest.mark.parametrize(("nv", "lanes"), [(31, 32), (35, 32), (36, 4)])
+def test_more_rows_than_lanes(nv, lanes, option, tmp_path):
+    """A chain on the floor, whose H and right side are dealt to the lanes more than once."""
+    geom = '<geom type="capsule" fromto="0 0 0 .1 0 0" size=".03" contype="0"/>'
+    chain = ""
+    for n in range(nv - 6):
+        joint = f'<joint axis="0 {n % 2} {1 - n % 2}" damping=".02" range="-40 40"/>'
+        chain = f'<body pos=".1 0 0">{joint}{geom}{chain}</body>'
+    world = f'<body pos="0 0 .04"><freejoint/>{geom}{chain}</body>'
+    m = _model(bodies=[], world=world, option=option)
+    assert m.nv == nv
+    m = m if option else _exact(m)
+    assert _largest_error(m, tmp_path, skip=2, starts=1, lanes=lanes) < 1e-9
+
+
+@needs_compiler
 @pytest.mark.parametrize("feature", _marked(_MODELS["features"]))
 def test_features(feature, tmp_path):
     m = _model(**_MODELS["features"][feature])
@@ -217,6 +234,15 @@ def test_two_geoms_meet_in_every_pose(kinds, sizes, tmp_path):
 def test_what_is_not_covered_is_named(reason):
     m = _model(**_REFUSED[reason])
     assert str(tables.why(m)).startswith(f"the model has {reason}")
+
+
+@pytest.mark.parametrize("reason", _MODELS["randomized"])
+def test_a_random_field_that_is_not_covered_is_named(reason):
+    parts = dict(_MODELS["randomized"][reason])
+    random = parts.pop("random")
+    m = _model(**parts)
+    assert tables.why(m) is None
+    assert str(tables.why(m, random)).startswith(f"the model has {reason}")
 
 
 def test_actuators_of_several_controls_are_named():

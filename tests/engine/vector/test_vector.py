@@ -167,7 +167,8 @@ def test_what_begins_episodes_by_itself_is_refused(wrapper):
     ("arguments", "message"),
     [
         ({"num_envs": 0}, "num_envs must be at least 1, got 0"),
-        ({"num_envs": 10**12}, "environments need .* make at most"),
+        ({"num_envs": 10**12}, r"num_envs must be less than 2\^31, got 1000000000000"),
+        ({"num_envs": 2**30}, "environments need .* make at most"),
         ({"max_episode_steps": 0}, "max_episode_steps must be at least 1, got 0"),
         ({"reset_noise": 1}, "reset_noise.*[^']$"),
         ({"autorest": "same_step"}, "'autorest'.* Known: "),

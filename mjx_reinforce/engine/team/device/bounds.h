@@ -53,12 +53,6 @@ struct Bounds {
       gradient += clip(force, -loss, loss);
     }
   }
-  // The stiffness alone.
-  DEV real stiffness(real qacc) const {
-    real gradient = 0, sum = 0;
-    push(qacc, gradient, sum);
-    return sum;
-  }
   // Adds what the rows cost along a step (see early_stop.h).
   template <class Sum> DEV void work(real qacc, real direction, Sum& sum) const {
     for (int n = 0; n < LIMITS; n++)

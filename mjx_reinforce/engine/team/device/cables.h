@@ -178,7 +178,7 @@ DEV void bend_bounds(const Team& t, const Model& M, const State& s, real length,
 // Adds to H and to the gradient what cables damp implicitly: where M may have an entry, as in
 // mj_implicitSkip.
 DEV void damp_cables(const Team& t, const Model& M, State& s, const real (&qacc)[ROWS_A_LANE],
-                     real (&gradient)[ROWS_A_LANE], real (&h)[ROWS_A_LANE][SIDE]) {
+                     real (&gradient)[ROWS_A_LANE], Rows& h) {
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
     if (t.lane + r * W < NV) s.qacc_warmstart[t.lane + r * W] = qacc[r];
   t.sync();

@@ -68,7 +68,8 @@ DEV Contact contact_of(const Model& M, const State& s, int item, const Touch& to
   const Softness& soft = M.soft[M.kind_soft[kind]];
   const real strength = impedance(soft, distance);
   c.item = item;
-  c.constraint_mass = constraint_mass(strength, M.item_weight[item]);
+  mix_friction(M, c);
+  c.constraint_mass = constraint_mass(strength, weight_of(M, c));
   // A pair may name a softness of the rows of friction of a cone.
   const real friction_damping =
       ELLIPTIC ? M.soft[M.kind_soft_friction[kind]].damping : soft.damping;

@@ -19,12 +19,12 @@ DEV Zone zone_of(real mu, real normal, real tangent) {
 // The cost at a length along the step.
 DEV ConeCost cone_cost(const Model& M, const Contact& c, real length) {
   const int kind = M.item_kind[c.item], dim = M.kind_dim[kind];
-  const real mu = M.kind_mu[kind], stiffness = c.constraint_mass / (mu * mu);
+  const real mu = mu_of(M, c, kind), stiffness = c.constraint_mass / (mu * mu);
   const real change = mu * c.change[0], normal = mu * c.residual[0] + length * change;
   real square = 0, half_slope = 0, half_curvature = 0;
   UNROLL for (int k = 1; k < CD; k++) {
     if (k >= dim) break;
-    const real friction = M.kind_friction[kind].along[k - 1];
+    const real friction = friction_of(M, c, kind).along[k - 1];
     const real by = friction * c.change[k], at = friction * c.residual[k] + length * by;
     square += at * at;
     half_slope += at * by;
@@ -58,14 +58,15 @@ DEV void bend_cone(const Model& M, const Contact& c, real length, Bend& sum) {
 }
 
 // Finds the force and the stiffness of a contact. The stiffness of the tangents is a diagonal and,
-// where the contact slides, c.stiffness[COUPLING] times the square of the stiffness of normal and tangents.
+// where the contact slides, c.stiffness[COUPLING] times the square of the stiffness of normal and
+// tangents.
 DEV void push_cone(const Model& M, Contact& c) {
   const int kind = M.item_kind[c.item], dim = M.kind_dim[kind];
-  const real mu = M.kind_mu[kind], normal = mu * c.residual[0];
+  const real mu = mu_of(M, c, kind), normal = mu * c.residual[0];
   real scaled[CD], square = 0;
   UNROLL for (int k = 1; k < CD; k++) {
     const bool has_row = k < dim;
-    scaled[k] = has_row ? M.kind_friction[kind].along[k - 1] * c.residual[k] : real(0);
+    scaled[k] = has_row ? friction_of(M, c, kind).along[k - 1] * c.residual[k] : real(0);
     square += scaled[k] * scaled[k];
   }
   const real tangent = root(square);
@@ -83,7 +84,7 @@ DEV void push_cone(const Model& M, Contact& c) {
   }
   UNROLL for (int k = 1; k < CD; k++) {
     if (zone == OUTSIDE || k >= dim) break;
-    const real friction = M.kind_friction[kind].along[k - 1];
+    const real friction = friction_of(M, c, kind).along[k - 1];
     if (zone == STICKS) {
       c.force[k] = -stiffness * friction * scaled[k];
       c.stiffness[CD - 1 + k] = stiffness * friction * friction;

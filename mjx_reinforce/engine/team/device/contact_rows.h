@@ -45,7 +45,7 @@ template <class F> DEV void each_edge(const Model& M, const Contact& c, F do_edg
   if (dim == 1) do_edge(real(0), 0, real(1));
   UNROLL for (int k = 1; k < CD; k++) {
     if (k < dim) {
-      const real friction = M.kind_friction[kind].along[k - 1];
+      const real friction = friction_of(M, c, kind).along[k - 1];
       do_edge(friction, k, real(1));
       do_edge(-friction, k, real(-1));
     }

@@ -35,18 +35,20 @@ DEV void actuate(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
   EACH(n, NCABLE) {
     Cable& cable = s.cables[n];
-    real force = 0, drag = TENDON_FORCES ? polynomial_rate(M.tendon[n].damping, fabs(cable.speed)) : real(0);
+    real force = 0, drag = 0;
+    if (TENDON_FORCES) drag = polynomial_rate(M.tendon[n].damping, fabs(cable.speed));
     drive(M, s, NV + n, cable.length, cable.speed, force, drag);
     cable.force = force;
     cable.drag = drag;
   }
   if (NCABLE) t.sync();
   EACH(i, NV) {
-    const real damping =
-        M.dof_damping[i] + (JOINT_LAWS ? polynomial_rate(M.dof_law[i].damping, fabs(s.qvel[i])) : real(0));
+    real damping = M.dof_damping[i];
+    if (JOINT_LAWS) damping += polynomial_rate(M.dof_law[i].damping, fabs(s.qvel[i]));
     real force = 0, drag = damping;
     drive(M, s, i, s.qpos[M.dof_qpos[i]], s.qvel[i], force, drag);
-    for (int n = 0; n < NCABLE; n++) force += s.cables[n].moment[i / 4].x[i % 4] * s.cables[n].force;
+    for (int n = 0; n < NCABLE; n++)
+      force += s.cables[n].moment[i / 4].x[i % 4] * s.cables[n].force;
     if (ACTUATOR_COMPENSATION && M.dof_actuator_compensation[i]) force += compensation(M, s, i);
     const Range range = M.dof_force[i];
     const bool bounded = IMPLICIT == 1 || force <= range.low || force >= range.high;

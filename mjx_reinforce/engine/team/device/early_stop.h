@@ -1,5 +1,6 @@
 // The solver of models that allow it few steps, or few lengths of one: what C answers is where its
-// search happened to be, so that this is C's own search (mj_solNewton; in JAX physics/early_stop.py).
+// search happened to be, so that this is C's own search (mj_solNewton; in JAX
+// physics/early_stop.py).
 #pragma once
 
 // A length of a step, and there the cost above that at length 0, with its derivatives.
@@ -100,26 +101,24 @@ DEV void move_inwards(Mark& end, const Mark& first, const Mark& second, const Ma
 
 // Where C's line search (PrimalSearch) ends: Newton steps along the line until the slope changes
 // its sign, then both ends of that interval move inwards. A round evaluates one length, so that the
-// code of mark_at, which is long, is there once.
+// code of mark_at, which is long, is there once; `starts` asks for length 1 alone.
+//
+// `along` is the slope at length 0. The curvature there is minus that, as H direction is minus the
+// gradient, so that the first Newton step is of length 1; C evaluates length 0, and counts it.
 DEV Mark line_as_c(const Team& t, const Model& M, State& s, const Search& search, const Step& step,
-                   real small) {
-  enum { AT_START, AT_NEWTON, FOLLOWS, AT_ROOT, AT_MIDDLE, AT_LOW_ROOT, AT_HIGH_ROOT };
-  int phase = AT_START, lengths = 0;
-  real length = 0, sign = 1;
+                   real along, real small, bool starts) {
+  enum { AT_NEWTON, FOLLOWS, AT_ROOT, AT_MIDDLE, AT_LOW_ROOT, AT_HIGH_ROOT };
+  int phase = AT_NEWTON, lengths = 1;
+  real length = 1, sign = 1;
   bool moves_low = false, moves_high = false;
-  Mark low = {}, high = {}, low_root = {}, high_root = {};
+  Mark low = {}, high = {0, 0, along, -along}, low_root = {}, high_root = {};
   LOOP for (;;) {
     const Mark mark = mark_at(t, M, s, search, step, length);
     lengths++;
+    if (starts) return mark;
     const bool flat = fabs(mark.slope) < small;
-    if (phase == AT_START) {
-      high = mark;
-      length = mark.next();
-      phase = AT_NEWTON;
-      continue;
-    }
     if (phase <= FOLLOWS) {
-      if (flat && (mark.cost < 0 || (phase == AT_NEWTON && mark.length == 0))) return mark;
+      if (flat && mark.cost < 0) return mark;
       if (phase == AT_NEWTON) sign = mark.slope < 0 ? real(1) : real(-1);
       if (phase == FOLLOWS) high = low;
       low = mark;
@@ -197,8 +196,8 @@ DEV void begin_step_as_c(const Team& t, const Model& M, State& s, Search& search
   }
 }
 
-// A search that stops early leaves a gradient, of which implicit damping takes part, and turn_free_bodies
-// in s.imbalance.
+// A search that stops early leaves a gradient, of which implicit damping takes part, and
+// turn_free_bodies in s.imbalance.
 DEV void damp_rest(const Team& t, const Model& M, State& s, Search& search) {
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
     const int i = t.lane + r * W;
@@ -219,7 +218,7 @@ DEV int newton_as_c(const Team& t, const Model& M, State& s) {
   int steps = -1;  // the first goes to the acceleration without rows, if that costs less
   LOOP for (;; steps++) {
     const bool starts = steps < 0, damps = IMPLICIT && settled;
-    real h[ROWS_A_LANE][SIDE];
+    Rows h;
     begin_step_as_c(t, M, s, search, starts, damps);
     if (!starts) each_contact(t, s, [&](Contact& c) { push(M, c); });
     t.sync();
@@ -247,20 +246,21 @@ DEV int newton_as_c(const Team& t, const Model& M, State& s) {
     }
     const Step step = {t.sum(slope), t.sum(curvature)};
     norm = root(t.sum(norm));
-    Mark mark;
-    if (starts) {
-      mark = mark_at(t, M, s, search, step, 1);
-      if (WARM && !(mark.cost < 0)) mark.length = 0;
-    } else {
+    along = t.sum(along);
+    if (!starts) {
       const bool flat = scale * root(t.sum(square)) < TOLERANCE;
-      const bool low = -scale * t.sum(along) / 2 < TOLERANCE;
+      const bool low = -scale * along / 2 < TOLERANCE;
       const bool slow = scale * improvement > 0 && scale * improvement < TOLERANCE;
       settled = steps == 0 ? flat && low : flat || low || slow;
-      mark = {0, 0, 0, 0};
-      if (!settled && norm >= real(1e-15)) {
-        const real small = TOLERANCE * LENGTH_TOLERANCE * norm / scale;
-        mark = line_as_c(t, M, s, search, step, small);
-      }
+    }
+    Mark mark = {0, 0, 0, 0};
+    if (starts || (!settled && norm >= real(1e-15))) {
+      const real small = TOLERANCE * LENGTH_TOLERANCE * norm / scale;
+      mark = line_as_c(t, M, s, search, step, along, small, starts);
+    }
+    if (starts) {
+      if (WARM && !(mark.cost < 0)) mark.length = 0;
+    } else {
       settled |= mark.length == 0 || steps + 1 >= STEPS;
       improvement = -mark.cost;
     }

@@ -7,8 +7,8 @@ static_assert(FAR * sizeof(Contact) <= sizeof(real) * (FAR_WORDS), "no room for 
 
 #ifdef __CUDACC__
 #define KERNEL __global__ void __launch_bounds__(WARPS * 32, 1)
-__device__ const Model MODEL MODEL_INIT;
-struct Shared { Model m; State s[TEAMS]; };
+__device__ const Fixed FIXED MODEL_INIT;
+struct Shared { Fixed m; State s[TEAMS]; };
 extern __shared__ __align__(16) char shared_bytes[];
 
 struct Player : Team {
@@ -27,21 +27,21 @@ struct Player : Team {
 };
 #define OWN_PLACE                                                                           \
   Shared& shared = *reinterpret_cast<Shared*>(shared_bytes);                                 \
-  for (int i = threadIdx.x; i < int(sizeof(Model) / 4); i += blockDim.x)                     \
-    reinterpret_cast<int*>(&shared.m)[i] = reinterpret_cast<const int*>(&MODEL)[i];          \
+  for (int i = threadIdx.x; i < int(sizeof(Fixed) / 4); i += blockDim.x)                     \
+    reinterpret_cast<int*>(&shared.m)[i] = reinterpret_cast<const int*>(&FIXED)[i];          \
   __syncthreads();                                                                          \
   const int team = threadIdx.x / W;                                                         \
   if (team >= TEAMS) return;                                                                \
-  const Model& M = shared.m;                                                                \
   State& s = shared.s[team];                                                                \
   const Player t;                                                                           \
   const int lane = t.lane;                                                                  \
+  const Model& M = model_of(shared.m, s, lane);                                             \
   scratch += size_t(blockIdx.x * (blockDim.x / W) + team) * (THREAD_WORDS * W);               \
   s.far = reinterpret_cast<Contact*>(scratch);                                              \
   scratch += FAR_WORDS;
 #else
 #define KERNEL void
-static const Model MODEL MODEL_INIT;
+static const Fixed FIXED MODEL_INIT;
 struct Player : Team {
   int next(int* counter) const { return (*counter)++; }
   bool some(bool flag) const { return flag; }
@@ -51,10 +51,10 @@ struct Player : Team {
   int first() const { return 0; }
 };
 #define OWN_PLACE               \
-  const Model& M = MODEL;       \
   static State s;               \
   static Contact far[FAR + 1];  \
   s.far = far;                  \
   const Player t;               \
-  const int lane = 0;
+  const int lane = 0;           \
+  const Model& M = model_of(FIXED, s, lane);
 #endif

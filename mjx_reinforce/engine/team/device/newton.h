@@ -54,32 +54,44 @@ DEV void begin_step(const Team& t, const Model& M, State& s, Search& search, boo
     if (i < NV) flat[i * (STRIDE + 1)] = search.diagonal[r] + stiffness;
   }
 }
-DEV void load_rows(const Team& t, const State& s, real (&h)[ROWS_A_LANE][SIDE]) {
+// M's rows; beyond the lanes' first columns from below the diagonal, the only place of M.
+DEV void load_rows(const Team& t, const State& s, Rows& h) {
+  const real* flat = &s.rows[0][0].x[0];
   UNROLL for (int q = 0; q < SIDE; q += 4)
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
       const int i = t.lane + r * W;
       const Quad row = s.rows[i < SIDE ? i : 0][q / 4];
-      for (int j = 0; j < 4; j++)
-        if (q + j < SIDE) h[r][q + j] = row.x[j];
+      for (int k = 0; k < 4; k++) {
+        const int j = q + k;
+        if (j < SIDE) h[r][j] = j < (r + 1) * W ? row.x[k] : flat[j * STRIDE + i];
+      }
     }
 }
 
+// Whether a contact may move a degree of freedom from row r W on: for all lanes alike.
+DEV bool moves_rows(const Model& M, const Contact& c, int r) {
+  const Item item = M.item[c.item];
+  const Mask first = M.link_dofs[M.geom_link[item.first()]];
+  const Mask second = M.link_dofs[M.geom_link[item.second()]];
+  return r * W < NV && (first ^ second) >> (r * W);
+}
 // Adds what contacts and general rows push to the rows of H, and subtracts their forces from the
 // gradient.
-DEV void add_rows(const Team& t, const Model& M, State& s, real (&h)[ROWS_A_LANE][SIDE],
-                  real (&gradient)[ROWS_A_LANE]) {
+DEV void add_rows(const Team& t, const Model& M, State& s, Rows& h, real (&gradient)[ROWS_A_LANE]) {
   // Two buffers by turns: a lane that is ahead writes the next contact's entries while others still
   // read this one's, and one sync a contact is enough.
   int turn = 0;
   all_contacts(t, s, [&](const Contact& c) {
     if (c.stiffness[0] == 0) return;
-    Quad(*const rows)[QUADS] = s.columns[turn];
+    Quad(*const rows)[quads(SIDE + 1)] = s.columns[turn];
     turn ^= 1;
     real entries[ROWS_A_LANE][CD];
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
       const int i = t.lane + r * W;
       for (int k = 0; k < CD; k++) entries[r][k] = 0;
-      if (i < NV) {
+      if (r > 0 && !moves_rows(M, c, r)) {
+        for (int k = 0; k < CD && i < SIDE; k++) rows[k][i / 4].x[i % 4] = 0;
+      } else if (i < NV) {
         basis(M, s, c, i, entries[r]);
         for (int k = 0; k < CD; k++) {
           rows[k][i / 4].x[i % 4] = entries[r][k];
@@ -121,8 +133,7 @@ DEV void add_rows(const Team& t, const Model& M, State& s, real (&h)[ROWS_A_LANE
 
 // Minus the gradient is the row below H, for the elimination, which so solves for it on the way.
 // One lane has that row, and each has a part of the gradient: it goes through memory.
-DEV void load_right_side(const Team& t, State& s, const Search& search,
-                         real (&h)[ROWS_A_LANE][SIDE]) {
+DEV void load_right_side(const Team& t, State& s, const Search& search, Rows& h) {
   real* right_side = &s.direction[0].x[0];
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
     const int i = t.lane + r * W;
@@ -132,6 +143,7 @@ DEV void load_right_side(const Team& t, State& s, const Search& search,
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
     if (t.lane + r * W == SIDE)
       UNROLL for (int j = 0; j < SIDE; j++) h[r][j] = right_side[j];
+  UNROLL for (int r = 0; r < ROWS_A_LANE - 1; r++) h[r][SIDE] = right_side[t.lane + r * W];
 }
 
 // How the residuals change along s.direction. Of contacts by the velocities that the direction
@@ -197,46 +209,14 @@ DEV void inertia_times_direction(const Team& t, const State& s, const Search& se
       for (int k = 0; k < 4; k++) {
         const int j = 4 * q + k;
         if (j >= NV) continue;
-        const real entry = j < row ? before.x[k] : flat[j * STRIDE + row];
-        if (j != row) out[r] += entry * step.x[k];
+        // Only in columns of the lanes' own numbers does it depend on the lane which is below.
+        const bool below = j < r * W || (j < (r + 1) * W && j < row);
+        const real entry = below ? before.x[k] : flat[j * STRIDE + row];
+        if (j / W != r || j != row) out[r] += entry * step.x[k];
       }
     }
     if (i >= NV) out[r] = 0;
   }
-}
-
-// Adds M direction to search.imbalance: H direction is minus the gradient, so M direction =
-// -gradient - J' stiffness J direction, without a product with M.
-DEV void follow(const Team& t, const Model& M, State& s, Search& search, real length) {
-  UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
-    search.imbalance[r] -=
-        length *
-        (search.gradient[r] + search.bounds[r].stiffness(search.qacc[r]) * search.direction[r]);
-  all_contacts(t, s, [&](const Contact& c) {
-    if (c.stiffness[0] == 0) return;
-    real force[CD];
-    stiffness_times(c, c.change, force);
-    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
-      const int i = t.lane + r * W;
-      real moves[CD];
-      if (i < NV) {
-        basis(M, s, c, i, moves);
-        for (int k = 0; k < CD; k++) search.imbalance[r] -= length * moves[k] * force[k];
-      }
-    }
-  });
-  t.sync();
-  for (int e = 0; e < NE; e++) {
-    real stiffness;
-    general_force(M, s, e, stiffness);
-    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
-      const int i = t.lane + r * W;
-      if (i < NV)
-        search.imbalance[r] -=
-            length * stiffness * s.general_change[e] * s.general[e][i / 4].x[i % 4];
-    }
-  }
-  if (NLIMITED + NLOSS) t.sync();  // before the residuals, which say what pushes, change
 }
 
 // Moves the acceleration and the residuals along the direction.
@@ -265,7 +245,7 @@ DEV int newton(const Team& t, const Model& M, State& s) {
     // Once it is settled, another round solves for what implicit damping adds: the same
     // elimination, so that the code of a solve, which is long, is there once.
     const bool damps = IMPLICIT && settled;
-    real h[ROWS_A_LANE][SIDE];
+    Rows h;
     begin_step(t, M, s, search, damps);
     if (!damps) each_contact(t, s, [&](Contact& c) { push(M, c); });
     t.sync();
@@ -293,13 +273,9 @@ DEV int newton(const Team& t, const Model& M, State& s) {
       // would gain its square. A tenth of that is for what the slope does not show.
       if (ELLIPTIC && SINGLE && length == 1)
         settled |= -along * line.rest * line.rest <= M.smallest_gain / 10;
-      if (ELLIPTIC) {
-        real inertia[ROWS_A_LANE];
-        inertia_times_direction(t, s, search, inertia);
-        UNROLL for (int r = 0; r < ROWS_A_LANE; r++) search.imbalance[r] += length * inertia[r];
-      } else {
-        follow(t, M, s, search, length);
-      }
+      real inertia[ROWS_A_LANE];
+      inertia_times_direction(t, s, search, inertia);
+      UNROLL for (int r = 0; r < ROWS_A_LANE; r++) search.imbalance[r] += length * inertia[r];
     }
     move_along(t, s, search, length);
     if (settled && !IMPLICIT) break;

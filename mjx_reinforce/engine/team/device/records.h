@@ -45,8 +45,11 @@ struct Tendon { real stiffness[3], damping[3], rest[2]; };
 struct Law { real stiffness[3], damping[3]; };
 // What a medium does to a body: its center, its axes of inertia, and the forces and torques along
 // these by the speed and by its square.
-struct FluidBody { real at[3], axes[9], viscous_torque, viscous_force, drag_torque[3], drag_force[3]; };
-// What gravity compensation holds of a link: the mass times its place in the link's frame, the mass.
+struct FluidBody {
+  real at[3], axes[9], viscous_torque, viscous_force, drag_torque[3], drag_force[3];
+};
+// What gravity compensation holds of a link: the mass times its place in the link's frame, the
+// mass.
 struct Compensation { real moment[3], mass; };
 // Along the two tangents, about the normal, about the two tangents.
 struct Friction { real along[5]; };

@@ -13,7 +13,8 @@ DEV void add_external(State& s, int b, real sign, const real* force, const real*
   }
 }
 
-// cfrc_ext of contacts, connect constraints and spatial tendons (MuJoCo's mj_rnePostConstraint). A lane has a body.
+// cfrc_ext of contacts, connect constraints and spatial tendons (MuJoCo's mj_rnePostConstraint). A
+// lane has a body.
 DEV void external_forces(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
   EACH(n, 6 * NB) s.cfrc_ext[n] = 0;

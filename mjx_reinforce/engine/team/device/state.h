@@ -20,8 +20,16 @@ DEV constexpr int padded(int n) { return n < 1 ? 4 : (n + 3) / 4 * 4; }
 // H has an even number of rows, a row of ones on the diagonal is added; the right side is one more.
 constexpr int SIDE = NV + NV % 2;
 constexpr int ROWS_A_LANE = (SIDE + W) / W;
-// Quads of a row: odd, so that lanes that read one row each meet no bank twice.
-constexpr int QUADS = ((SIDE + 4) / 4) | 1;
+// H and, as its row SIDE, the right side: h[r] is row lane + r W. As H is symmetric, entries before
+// column r W are not used: they are those of rows before, which have the right side as column SIDE.
+typedef real Rows[ROWS_A_LANE][SIDE + (ROWS_A_LANE > 1)];
+DEV constexpr bool uses_column(int r, int j) {
+  return j >= r * W && j < SIDE + (r < ROWS_A_LANE - 1);
+}
+// Quads of so many numbers: odd, so that lanes that read one row each meet no bank twice.
+DEV constexpr int quads(int numbers) { return ((numbers + 3) / 4) | 1; }
+// Of a row, in which the right side has a place only where a lane has one row.
+constexpr int QUADS = quads(SIDE + (ROWS_A_LANE == 1));
 constexpr int STRIDE = 4 * QUADS;
 // Contacts that the state has no room for.
 constexpr int FAR = NI > NEAR ? NI - NEAR : 0;
@@ -40,9 +48,11 @@ DEV constexpr bool reports(int fields) { return (REPORTS) & fields; }
 DEV constexpr int room(int fields, int numbers) { return reports(fields) ? numbers * NB : 1; }
 
 // A contact's rows are those of an elliptic cone, or the edges n + mu t and n - mu t of a pyramid;
-// here they are in the basis of the normal, the tangents and, from condim 4 on, turning about these.
+// here they are in the basis of the normal, the tangents and, from condim 4 on, turning about
+// these.
 constexpr int COUPLING = 2 * CD - 2 + ELLIPTIC;
-struct Contact {
+// A contact has friction of its own where episodes draw it.
+struct Contact : Some<Friction, DRAWS_FRICTION> {
   real at[3];               // from the point of reference (m)
   real frame[9];            // normal, two tangents
   real residual[CD];        // J qacc - reference
@@ -61,7 +71,8 @@ struct Cable {
   real length, speed, acceleration, force, drag;
 };
 
-struct alignas(4 * sizeof(real)) State {
+// Before all else it has the tables that an episode draws, if any (draws.py).
+struct alignas(4 * sizeof(real)) State : Drawn {
   real qpos[padded(NQ)], qvel[padded(NV)], qacc_warmstart[padded(NV)];
   real qfrc_actuator[padded(NV)], ctrl[padded(NU)], act[1], time[1];
   Quad cdof[NV][2];
@@ -91,7 +102,7 @@ struct alignas(4 * sizeof(real)) State {
     Quad terms[NV][2];
   };
   union {
-    Quad columns[2][CD < 2 ? 2 : CD][QUADS];
+    Quad columns[2][CD < 2 ? 2 : CD][quads(SIDE + 1)];
     struct { Quad geom_place[NG]; Quad geom_axis[NG]; };
   };
   Contact guest;        // a far contact that is everybody's for a moment

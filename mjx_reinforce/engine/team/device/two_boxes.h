@@ -55,7 +55,7 @@ DEV bool direction_apart(const TwoBoxes& two, real most, Apart& apart) {
   apart.edges = -1;
   LOOP for (int n = 0; n < 9; n++) {
     const int i = n / 3, j = n % 3;
-    real along[3] = {i == 0, i == 1, i == 2}, axis[3], other_axis[3];
+    real along[3] = {real(i == 0), real(i == 1), real(i == 2)}, axis[3], other_axis[3];
     const real other_along[3] = {two.turn[0][0][j], two.turn[0][1][j], two.turn[0][2][j]};
     cross(axis, along, other_along);
     const real square = dot(axis, axis);

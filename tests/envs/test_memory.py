@@ -1,0 +1,260 @@
+"""Episodes that remember: noise, delays, commands and pushes are the same in every engine."""
+
+import re
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mujoco import MjSpec  # type: ignore
+
+from mjx_reinforce import make_vec
+from mjx_reinforce.engine import rollout
+from mjx_reinforce.envs.base import MujocoEnv
+from mjx_reinforce.envs.in_mujoco import InMujoco
+
+MODEL = """
+<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 1"/>
+    <body pos="0 0 0.3">
+      <freejoint/>
+      <geom size="0.1"/>
+      <body pos="0.2 0 0">
+        <joint name="arm" axis="0 1 0" damping="0.1"/>
+        <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.03" contype="0" conaffinity="0"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="arm" gear="0.5" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+DELAY = 2
+PERIOD = 3
+STEPS = 12
+
+
+class Pushed(MujocoEnv):
+    """Late actions, noisy observations with the last action, a command and pushes that change."""
+
+    def __init__(self):
+        super().__init__(
+            xml_file=MjSpec.from_string(MODEL),
+            frame_skip=4,
+            max_episode_steps=STEPS,
+            reward_threshold=None,
+        )
+
+    def initial(self, rng):
+        return jnp.asarray(self.mj_model.qpos0), 0.1 * jax.random.normal(rng, (7,))
+
+    def memory(self, rng, data):
+        return {
+            "actions": jnp.zeros((DELAY, 1)),
+            "command": jax.random.uniform(rng),
+            "noise": jnp.zeros(1),
+            "push": jnp.zeros(2),
+            "step": 0,
+        }
+
+    def actuate(self, before, action):
+        return self.control(before.memory["actions"][0])
+
+    def push(self, before):
+        return jnp.zeros(7).at[:2].set(before.memory["push"])
+
+    def remember(self, rng, data, action):
+        noise_key, command_key, push_key = jax.random.split(rng, 3)
+        old = data.memory
+        is_due = (old["step"] + 1) % PERIOD == 0
+        push = jax.random.uniform(push_key, (2,), minval=-0.5, maxval=0.5)
+        return {
+            "actions": jnp.concatenate([old["actions"][1:], action[None]]),
+            "command": jnp.where(is_due, jax.random.uniform(command_key), old["command"]),
+            "noise": 0.1 * jax.random.normal(noise_key, (1,)),
+            "push": jnp.where(is_due, push, 0.0),
+            "step": old["step"] + 1,
+        }
+
+    def observe(self, data):
+        arm = data.joint("arm")
+        command = data.memory["command"][None]
+        last_action = data.memory["actions"][-1]
+        return jnp.concatenate(
+            [arm.qpos + data.memory["noise"], arm.qvel, command, last_action, data.qvel[:2]]
+        )
+
+    def outcome(self, before, data, action):
+        change = action[0] - before.memory["actions"][-1, 0]
+        reward = data.memory["command"] - before.memory["command"] - change**2
+        return reward, False, {"reward_change": reward}
+
+
+class Fixed:
+    """No noise: the policy's output is the action."""
+
+    def noise(self, key, shape):
+        return jnp.zeros((*shape, 1))
+
+    def sample(self, outputs, noise):
+        return outputs
+
+    mode = staticmethod(lambda outputs: outputs)
+
+
+def act(params, observation):
+    """Returns an action that depends on all that is observed."""
+    return jnp.tanh(observation @ params)[None]
+
+
+PARAMS = np.array([1.0, -0.3, 2.0, -0.7, 0.5, -0.5])
+
+
+def played(engine, env, num_episodes=3):
+    """Returns the observations [T, O, N] and rewards [T, N] that an engine plays."""
+    params = jnp.asarray(PARAMS, jnp.result_type(float))
+    options = {"num_episodes": num_episodes, "horizon": STEPS, "engine": engine}
+    trajectory = jax.jit(lambda params, key: rollout(env, act, params, Fixed(), key, **options))(
+        params, jax.random.key(3)
+    )
+    return np.asarray(trajectory.observation), np.asarray(trajectory.reward)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return Pushed()
+
+
+@pytest.fixture(scope="module")
+def by_vmap(env):
+    return played("vmap", env)
+
+
+@pytest.mark.parametrize("engine", ["native", "mujoco"])
+def test_all_engines_play_the_same_episodes(env, by_vmap, engine):
+    for other, expected in zip(played(engine, env), by_vmap, strict=True):
+        np.testing.assert_allclose(other, expected, rtol=0, atol=2e-5)
+
+
+def test_one_episode_in_c_mujoco_is_that_of_the_task(env):
+    """``watch`` plays with it; the first observations of 100 starts have different commands."""
+    key = jax.random.key(5)
+    simulation = InMujoco(env)
+    state = jax.jit(env.reset)(key)
+    step = jax.jit(env.step)
+    np.testing.assert_allclose(simulation.reset(key), state.obs, atol=1e-6)
+    for number in range(STEPS):
+        action = np.sin(np.full(1, number, np.float32))
+        state = step(state, action)
+        observation, reward, _ = simulation.step(action)
+        np.testing.assert_allclose(observation, state.obs, atol=2e-5)
+        np.testing.assert_allclose(reward, state.reward, atol=1e-6)
+
+
+def test_an_action_comes_late_and_the_last_one_is_observed(env):
+    step = jax.jit(env.step)
+    states = [jax.jit(env.reset)(jax.random.key(0))]
+    actions = np.linspace(-0.9, 0.9, STEPS, dtype=np.float32)[:, None]
+    for action in actions:
+        states.append(step(states[-1], action))
+    np.testing.assert_allclose([s.obs[3] for s in states[1:]], actions[:, 0])
+    late = np.concatenate([np.zeros((DELAY, 1)), actions])[:STEPS]
+    # Without pushes and noise the arm moves as under the late actions in a task without delay.
+    quiet = type("Quiet", (Pushed,), {"push": lambda self, before: jnp.zeros(7)})()
+    prompt = type("Prompt", (type(quiet),), {"actuate": MujocoEnv.actuate})()
+    first, second = quiet.reset(jax.random.key(0)), prompt.reset(jax.random.key(0))
+    quiet_step, prompt_step = jax.jit(quiet.step), jax.jit(prompt.step)
+    for action, late_action in zip(actions, late, strict=True):
+        first = quiet_step(first, action)
+        second = prompt_step(second, late_action.astype(np.float32))
+        np.testing.assert_allclose(first.pipeline_state.qpos, second.pipeline_state.qpos, atol=1e-6)
+
+
+def test_noise_differs_from_step_to_step_and_has_its_deviation(env):
+    step = jax.jit(jax.vmap(env.step))
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 500))
+    errors = []
+    for _ in range(4):
+        state = step(state, jnp.zeros((500, 1)))
+        errors.append(np.asarray(state.obs[:, 0] - state.pipeline_state.qpos[:, 7]))
+    errors = np.array(errors)
+    assert errors.std() == pytest.approx(0.1, abs=0.005)
+    assert np.abs(np.corrcoef(errors) - np.eye(4)).max() < 0.15
+    commands = np.asarray(state.pipeline_state.memory["command"])
+    assert len(np.unique(commands)) > 490  # of some 8 million
+    assert commands.mean() == pytest.approx(0.5, abs=0.04)
+
+
+def test_a_push_changes_the_velocity_with_which_a_step_begins(env):
+    """After ``PERIOD`` steps the body is pushed, in the next step."""
+    state = env.reset(jax.random.key(2))
+    step = jax.jit(env.step)
+    for number in range(1, 2 * PERIOD + 1):
+        push = np.asarray(state.pipeline_state.memory["push"])
+        assert np.any(push != 0) == (number > 1 and (number - 1) % PERIOD == 0)
+        before = np.asarray(state.pipeline_state.qvel[:2])
+        state = step(state, jnp.zeros(1))
+        # What is left of a push after 8 ms in the air or on the floor is most of it.
+        change = np.asarray(state.pipeline_state.qvel[:2]) - before
+        np.testing.assert_allclose(change, push, atol=0.12)
+
+
+def test_environments_in_lockstep_begin_episodes_with_a_memory_of_their_own(env):
+    vec = make_vec(env, num_envs=4)
+    state = vec.reset(jax.random.key(0))
+    commands = np.asarray(state.obs[:, 2])
+    assert len(np.unique(commands)) == 4
+    for _ in range(STEPS + 1):
+        state = vec.step(state, jnp.zeros((4, 1)))
+    assert not np.isin(np.asarray(state.obs[:, 2]), commands).any()
+
+
+def test_a_task_without_memory_has_the_state_it_had():
+    class Plain(Pushed):
+        memory = MujocoEnv.memory
+        remember = MujocoEnv.remember
+        actuate = MujocoEnv.actuate
+        push = MujocoEnv.push
+
+        def observe(self, data):
+            return data.qpos
+
+        def outcome(self, before, data, action):
+            return 0.0, False, {}
+
+    state: Any = Plain().reset(jax.random.key(0)).pipeline_state
+    assert (state.memory, state.key) == ({}, ())
+    assert len(jax.tree.leaves(state)) == 5
+
+
+@pytest.mark.parametrize(
+    ("method", "result", "message"),
+    [
+        ("memory", [1], "Wrong.memory must return a dict of arrays by their names, got a list"),
+        ("memory", {"x": "y"}, "'x' of Wrong.memory must be an array, got"),
+        ("remember", {"x": np.zeros(3)}, "'x' of Wrong.remember must be [2], got the shape [3]"),
+        ("remember", {}, "Wrong.remember must return what Wrong.memory does (x), got nothing"),
+        (
+            "push",
+            np.zeros(2),
+            "Wrong.push must return [7], a change of each velocity, got the shape [2]",
+        ),
+        ("actuate", np.zeros(2), "Wrong.control must return [1], a control for each actuator"),
+    ],
+)
+@pytest.mark.parametrize("engine", ["vmap", "mujoco"])
+def test_what_is_no_memory_is_refused(engine, method, result, message):
+    methods = {
+        "memory": lambda self, rng, data: {"x": np.zeros(2)},
+        "remember": MujocoEnv.remember,
+        "push": MujocoEnv.push,
+        "actuate": MujocoEnv.actuate,
+        "observe": MujocoEnv.observe,
+        "outcome": lambda self, before, data, action: (0.0, False, {}),
+    }
+    methods[method] = lambda self, *arguments: result
+    wrong = type("Wrong", (Pushed,), methods)()
+    task = wrong.in_c_mujoco() if engine == "mujoco" else wrong
+    with pytest.raises(ValueError, match=re.escape(message)):
+        jax.eval_shape(lambda key: task.step(task.reset(key), jnp.zeros(1)), jax.random.key(0))
