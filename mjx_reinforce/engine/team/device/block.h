@@ -4,7 +4,7 @@
 #pragma once
 #ifdef __CUDACC__
 constexpr int GROUPS = 2, WHOLE = 32 / W;
-constexpr int FITTING = int((SHARED - sizeof(Model) - 16) / sizeof(State)) / WHOLE * WHOLE;
+constexpr int FITTING = int((SHARED - sizeof(Fixed) - 16) / sizeof(State)) / WHOLE * WHOLE;
 constexpr int TEAMS = FITTING < WARPS * WHOLE ? FITTING : WARPS * WHOLE;
 static_assert(TEAMS > 0, "the state of a team does not fit into shared memory");
 

@@ -9,6 +9,7 @@ static_assert(FAR * sizeof(Contact) <= sizeof(real) * (FAR_WORDS), "no room for 
 #define KERNEL __global__ void __launch_bounds__(WARPS * 32, 1)
 __device__ const Fixed FIXED MODEL_INIT;
 struct Shared { Fixed m; State s[TEAMS]; };
+static_assert(sizeof(Shared) <= SHARED, "the teams do not fit into shared memory");
 extern __shared__ __align__(16) char shared_bytes[];
 
 struct Player : Team {
