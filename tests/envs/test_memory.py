@@ -216,6 +216,14 @@ def test_environments_in_lockstep_begin_episodes_with_a_memory_of_their_own(env)
     assert not np.isin(np.asarray(state.obs[:, 2]), commands).any()
 
 
+@pytest.mark.parametrize("engine", ["vmap", "mujoco"])
+def test_keys_of_every_generator_begin_a_memory(env, engine):
+    task = env.in_c_mujoco() if engine == "mujoco" else env
+    keys = [jax.random.key(seed, impl="rbg") for seed in (0, 1)]
+    commands = [jax.jit(task.reset)(key).pipeline_state.memory["command"] for key in keys]
+    assert commands[0] != commands[1]
+
+
 def test_a_task_without_memory_has_the_state_it_had():
     class Plain(Pushed):
         memory = MujocoEnv.memory
@@ -313,7 +321,7 @@ def test_a_task_may_change_the_dict_that_it_reads(engine):
         return
     task = env.in_c_mujoco() if engine == "mujoco" else env
     state = jax.jit(task.reset)(jax.random.key(0))
-    step = jax.jit(task.step)
+    step: Any = jax.jit(task.step)
     for number in range(1, 4):
         state = step(state, jnp.zeros(1))
         assert (*state.obs, state.reward) == (number, 0, 10 * number, 1)
@@ -358,7 +366,7 @@ def test_attributes_of_a_task_may_have_the_names_of_methods_that_it_lacks():
         "observe": MujocoEnv.observe,
         "outcome": lambda self, before, data, action: (self.push, False, {}),
     }
-    env = type("Older", (Counting,), methods)()
+    env: Any = type("Older", (Counting,), methods)()
     env.memory, env.remember, env.push = 1, 2, 3
     task = env.in_c_mujoco()
     state = jax.jit(lambda key: task.step(task.reset(key), jnp.zeros(1)))(jax.random.key(0))
