@@ -218,7 +218,7 @@ class MujocoEnv(Env):
           action: [A] as the policy gave it.
 
         Returns:
-          All that ``memory`` returns, in the same shapes.
+          All that ``memory`` returns, in the same shapes and dtypes.
         """
         return data.memory
 
@@ -254,7 +254,10 @@ class MujocoEnv(Env):
     @property
     def has_memory(self) -> bool:
         """Whether the task's episodes remember something."""
-        return type(self).memory is not MujocoEnv.memory
+        # Of ``remember`` alone, ``check_memory`` says that there is nothing to take the place of.
+        task = type(self)
+        methods = (MujocoEnv.memory, MujocoEnv.remember)
+        return (task.memory, task.remember) != methods
 
     @property
     def has_pushes(self) -> bool:

@@ -82,6 +82,7 @@ class FieldRecorder(Named):
     def __init__(self, data: Any, mj_model: MjModel):
         self.mj_model = mj_model
         self.episode = {}
+        self.memory = {}
         self.data = data
         self.names: set[str] = set()
 
@@ -102,11 +103,12 @@ def read_all(env: Any, before: Before, recorder: Any, action: jax.Array) -> None
       recorder: a ``FieldRecorder`` in place of the simulation after it.
       action: [A] of any numbers.
     """
-    key = jax.random.key(0)
-    recorder.memory = before.memory = env.memory(key, recorder)
+    recollection = recollect_start(env, jax.random.key(0), recorder)
+    before.memory = dict(recollection.memory)
     env.actuate(before, action)
-    env.push(before)
-    recorder.memory = env.remember(key, recorder, action)
+    if env.has_pushes:
+        env.push(before)
+    recollect_step(env, recollection, recorder, action)
     env.outcome(before, recorder, action)
     env.observe(recorder)
 

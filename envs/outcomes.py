@@ -12,7 +12,7 @@ from mujoco import mjx
 
 from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.checks import require
-from mjx_reinforce.engine.contract import check_shape, in_words, shape_of
+from mjx_reinforce.engine.contract import check_shape, described, in_words, shape_of
 from mjx_reinforce.envs.models import RANDOM
 from mjx_reinforce.envs.refusals import UnsupportedError
 
@@ -131,10 +131,13 @@ def check_memory(
     require(is_named, f"{requirement}, got {in_words(entries)}")
     memory = dict(cast(Any, entries))
     for key, value in memory.items():
+        dtype = getattr(value, "dtype", type(value))
+        is_numeric = dtype in (bool, int, float) or jnp.issubdtype(dtype, np.number)
         entry = f"{key!r} of {name}.{method}"
-        require(shape_of(value) is not None, f"{entry} must be an array, got {in_words(value)}")
+        require(is_numeric, f"{entry} must be an array of numbers, got {described(value)}")
     if before is None:
-        return {key: jnp.asarray(value) for key, value in memory.items()}
+        # A number of Python has no dtype of its own, and would be compiled for once more.
+        return {key: jnp.asarray(x, jnp.result_type(x)) for key, x in memory.items()}
     require(
         memory.keys() == before.keys(),
         f"{name}.{method} must return what {name}.memory does ({', '.join(before) or 'nothing'}), "
@@ -142,6 +145,14 @@ def check_memory(
     )
     for key, value in memory.items():
         check_shape(f"{key!r} of {name}.{method}", value, before[key].shape)
+        dtype = before[key].dtype
+        # A count that becomes a fraction would lose it in each step.
+        next_dtype = jnp.result_type(dtype, value)
+        require(
+            next_dtype == dtype,
+            f"{key!r} of {name}.{method} must be {dtype}, as {name}.memory returns it, got "
+            f"{next_dtype}; return another number there, or write .astype({dtype}) here",
+        )
     return {key: jnp.asarray(memory[key], before[key].dtype) for key in before}
 
 

@@ -122,4 +122,4 @@ class View(Named, Simulation):
         super().__init__(data)
         self.mj_model = mj_model
         self.episode = episode
-        self.memory = memory or {}
+        self.memory = dict(memory or {})

@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from flax import struct
 
 from mjx_reinforce.engine.base import MjModel
@@ -54,7 +55,7 @@ class Before(Named, Simulation):
         vars(self).update(fields)
         self.mj_model = mj_model
         self.episode = episode
-        self.memory = memory or {}
+        self.memory = dict(memory or {})
 
     def __getattr__(self, name: str) -> Any:
         raise AttributeError(
@@ -86,10 +87,13 @@ def recollect_start(env: Any, rng: jax.Array | None, view: Any) -> Recollection:
         return NOTHING
     if rng is None:
         rng = jax.random.key(0)
-    key, memory_key = jax.random.split(key_of_words(jax.random.key_data(rng)))
-    view.memory = check_memory(type(env).__name__, "memory", env.memory(memory_key, view))
+    # Two words, whatever generator the key is of.
+    key, memory_key = jax.random.split(key_of_words(jax.random.bits(rng, 2, jnp.uint32)))
+    memory = check_memory(type(env).__name__, "memory", env.memory(memory_key, view))
+    # A copy, here and below: a task may change entries of the dict that it reads.
+    view.memory = dict(memory)
     # The words: machine code knows arrays of numbers alone.
-    return Recollection(view.memory, jax.random.key_data(key))
+    return Recollection(memory, jax.random.key_data(key))
 
 
 def recollect_step(
@@ -106,7 +110,8 @@ def recollect_step(
     if not env.has_memory:
         return NOTHING
     key, step_key = jax.random.split(key_of_words(before.key))
-    view.memory = before.memory
+    view.memory = dict(before.memory)
     entries = env.remember(step_key, view, action)
-    view.memory = check_memory(type(env).__name__, "remember", entries, before.memory)
-    return Recollection(view.memory, jax.random.key_data(key))
+    memory = check_memory(type(env).__name__, "remember", entries, before.memory)
+    view.memory = dict(memory)
+    return Recollection(memory, jax.random.key_data(key))

@@ -121,6 +121,12 @@ def played(engine, env, num_episodes=3):
     return np.asarray(trajectory.observation), np.asarray(trajectory.reward)
 
 
+def traced_step(env, engine):
+    """Traces the first env step of an episode, by MJX or C MuJoCo."""
+    task = env.in_c_mujoco() if engine == "mujoco" else env
+    jax.eval_shape(lambda key: task.step(task.reset(key), jnp.zeros(1)), jax.random.key(0))
+
+
 @pytest.fixture(scope="module")
 def env():
     return Pushed()
@@ -210,6 +216,14 @@ def test_environments_in_lockstep_begin_episodes_with_a_memory_of_their_own(env)
     assert not np.isin(np.asarray(state.obs[:, 2]), commands).any()
 
 
+@pytest.mark.parametrize("engine", ["vmap", "mujoco"])
+def test_keys_of_every_generator_begin_a_memory(env, engine):
+    task = env.in_c_mujoco() if engine == "mujoco" else env
+    keys = [jax.random.key(seed, impl="rbg") for seed in (0, 1)]
+    commands = [jax.jit(task.reset)(key).pipeline_state.memory["command"] for key in keys]
+    assert commands[0] != commands[1]
+
+
 def test_a_task_without_memory_has_the_state_it_had():
     class Plain(Pushed):
         memory = MujocoEnv.memory
@@ -232,7 +246,18 @@ def test_a_task_without_memory_has_the_state_it_had():
     ("method", "result", "message"),
     [
         ("memory", [1], "Wrong.memory must return a dict of arrays by their names, got a list"),
-        ("memory", {"x": "y"}, "'x' of Wrong.memory must be an array, got"),
+        ("memory", {"x": "y"}, "'x' of Wrong.memory must be an array of numbers, got a str"),
+        (
+            "memory",
+            {"x": np.array("y")},
+            "'x' of Wrong.memory must be an array of numbers, got <U1[]",
+        ),
+        ("memory", {"x": {}}, "'x' of Wrong.memory must be an array of numbers, got a dict"),
+        (
+            "memory",
+            {"x": jax.random.key(0)},
+            "'x' of Wrong.memory must be an array of numbers, got key",
+        ),
         ("remember", {"x": np.zeros(3)}, "'x' of Wrong.remember must be [2], got the shape [3]"),
         ("remember", {}, "Wrong.remember must return what Wrong.memory does (x), got nothing"),
         (
@@ -245,7 +270,7 @@ def test_a_task_without_memory_has_the_state_it_had():
 )
 @pytest.mark.parametrize("engine", ["vmap", "mujoco"])
 def test_what_is_no_memory_is_refused(engine, method, result, message):
-    methods = {
+    methods: dict[str, Any] = {
         "memory": lambda self, rng, data: {"x": np.zeros(2)},
         "remember": MujocoEnv.remember,
         "push": MujocoEnv.push,
@@ -255,6 +280,95 @@ def test_what_is_no_memory_is_refused(engine, method, result, message):
     }
     methods[method] = lambda self, *arguments: result
     wrong = type("Wrong", (Pushed,), methods)()
-    task = wrong.in_c_mujoco() if engine == "mujoco" else wrong
     with pytest.raises(ValueError, match=re.escape(message)):
-        jax.eval_shape(lambda key: task.step(task.reset(key), jnp.zeros(1)), jax.random.key(0))
+        traced_step(wrong, engine)
+
+
+class Counting(Pushed):
+    """It counts its steps, in all of what ``memory`` may return."""
+
+    actuate = MujocoEnv.actuate
+    push = MujocoEnv.push
+
+    def memory(self, rng, data):
+        return {"array": np.zeros(2), "float": 0.0, "int": 0, "bool": False}
+
+    def remember(self, rng, data, action):
+        memory = data.memory
+        memory["array"] = memory["array"].at[0].add(1.0)
+        memory["float"] = memory["float"][None][0] + 1
+        memory["int"] = memory["int"] + memory["int"].astype(bool) + ~memory["bool"]
+        return memory | {"bool": ~memory["bool"]}
+
+    def observe(self, data):
+        data.memory["float"] = 10 * data.memory["float"]
+        return jnp.append(data.memory["array"], data.memory["float"])
+
+    def outcome(self, before, data, action):
+        return data.memory["array"][0] - before.memory["array"][0], False, {}
+
+
+@pytest.mark.parametrize("engine", ["vmap", "mujoco", "InMujoco"])
+def test_a_task_may_change_the_dict_that_it_reads(engine):
+    """What it changes there is neither what ``outcome`` sees of before, nor what comes next."""
+    env = Counting()
+    if engine == "InMujoco":
+        simulation = InMujoco(env)
+        simulation.reset(jax.random.key(0))
+        for number in range(1, 4):
+            observation, reward, _ = simulation.step(np.zeros(1, np.float32))
+            assert (*observation, reward) == (number, 0, 10 * number, 1)
+        return
+    task = env.in_c_mujoco() if engine == "mujoco" else env
+    state = jax.jit(task.reset)(jax.random.key(0))
+    step: Any = jax.jit(task.step)
+    for number in range(1, 4):
+        state = step(state, jnp.zeros(1))
+        assert (*state.obs, state.reward) == (number, 0, 10 * number, 1)
+    assert step._cache_size() == 1
+
+
+@pytest.mark.parametrize("engine", ["vmap", "mujoco"])
+def test_a_count_that_becomes_a_fraction_is_refused(engine):
+    """Each step would cut the fraction off: the time would stay 0."""
+    methods = {
+        "memory": lambda self, rng, data: {"time": 0},
+        "observe": MujocoEnv.observe,
+        "outcome": lambda self, before, data, action: (0.0, False, {}),
+        "remember": lambda self, rng, data, action: (
+            data.memory | {"time": data.memory["time"] + 0.5}
+        ),
+    }
+    env = type("Late", (Counting,), methods)()
+    message = "'time' of Late.remember must be int32, as Late.memory returns it, got float32"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        traced_step(env, engine)
+
+
+def test_to_remember_without_a_memory_is_refused():
+    methods = {
+        "memory": MujocoEnv.memory,
+        "remember": lambda self, rng, data, action: {"x": action},
+        "observe": MujocoEnv.observe,
+        "outcome": lambda self, before, data, action: (0.0, False, {}),
+    }
+    env = type("Lost", (Counting,), methods)()
+    message = "Lost.remember must return what Lost.memory does (nothing), got x"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        traced_step(env, "vmap")
+
+
+def test_attributes_of_a_task_may_have_the_names_of_methods_that_it_lacks():
+    """Tasks had such attributes before these methods were there."""
+    methods = {
+        "memory": MujocoEnv.memory,
+        "remember": MujocoEnv.remember,
+        "observe": MujocoEnv.observe,
+        "outcome": lambda self, before, data, action: (self.push, False, {}),
+    }
+    env: Any = type("Older", (Counting,), methods)()
+    env.memory, env.remember, env.push = 1, 2, 3
+    task = env.in_c_mujoco()
+    state = jax.jit(lambda key: task.step(task.reset(key), jnp.zeros(1)))(jax.random.key(0))
+    assert state.reward == 3
+    InMujoco(env).reset(jax.random.key(0))

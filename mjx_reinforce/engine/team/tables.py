@@ -170,6 +170,7 @@ class _Tables:
         self.constants["NB"] = model.nbody
         self.constants["NU"] = max(model.nu, 1)
         self.constants["IMPLICIT"] = self._implicit()
+        self.constants["MAY_SKIP"] = self._may_skip()
         is_passive = any(self.constants[x] for x in ("NCOMPENSATED", "TENDON_FORCES", "JOINT_LAWS"))
         self.constants["PASSIVE"] = int(is_passive)
         self.constants["RK4"] = int(model.opt.integrator == _C.mjtIntegrator.mjINT_RK4)
@@ -255,11 +256,21 @@ class _Tables:
             return 2
         is_euler = opt.integrator == _C.mjtIntegrator.mjINT_EULER
         is_off = any(flags.is_off(self.model, x) for x in ("eulerdamp", "damper"))
-        # With the armature of an actuator, C solves once more (mj_EulerSkip): this only matters for
-        # a search that stops early.
-        solves_again = stops_early(self.model) and np.any(self.model.jnt_actuatorid != -1)
         is_damped = self.damping.any() or "dof_damping" in self.random
-        return int(is_euler and not is_off and (is_damped or solves_again))
+        return int(is_euler and not is_off and (is_damped or self._solves_again()))
+
+    def _solves_again(self) -> bool:
+        """Returns whether C solves once more for the armature of an actuator (mj_EulerSkip).
+
+        This only matters for a search that stops early.
+        """
+        return stops_early(self.model) and bool(np.any(self.model.jnt_actuatorid != -1))
+
+    def _may_skip(self) -> bool:
+        """Returns whether C does not solve once more in an episode that draws no damping."""
+        is_drawn = stops_early(self.model) and "dof_damping" in self.random
+        is_damped = bool(self.damping[:, 1:].any()) or self._solves_again()
+        return self._implicit() == 1 and is_drawn and not is_damped
 
     def _records(self, name: str, order: Any = slice(None), **columns: np.ndarray) -> None:
         """Makes a table of structs from the columns of their fields, [rows] or [rows, numbers]."""

@@ -170,6 +170,18 @@ def test_each_field_is_as_in_c(name, tmp_path):
 
 
 @needs_compiler
+@pytest.mark.slow
+def test_a_search_that_stops_early_solves_for_no_damping_that_is_not_drawn(tmp_path):
+    m = _walker("few steps")
+    play = device_code.compiled(m, tmp_path, random=("dof_damping",))
+    for scale in (0, 1):
+        fields = {"dof_damping": scale * m.dof_damping}
+        error, touched = _error(m, play, fields, _numbers(m, ("dof_damping",), fields))
+        assert error < 1e-9
+        assert touched > 10
+
+
+@needs_compiler
 @pytest.mark.parametrize("lanes", [1, 8])
 @pytest.mark.parametrize("options", _MARKED)
 def test_episodes_that_draw_all_fields_share_a_program(options, lanes, tmp_path):

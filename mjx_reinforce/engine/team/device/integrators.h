@@ -111,12 +111,19 @@ DEV void runge_kutta(const Team& t, const Model& M, State& s, bool last) {
     t.sync();
   }
 }
+// Whether damping changes the acceleration, also of a search that stops early (mj_EulerSkip).
+DEV bool is_damped(const Model& M) {
+  bool some = !MAY_SKIP;
+  for (int i = 0; i < NV && MAY_SKIP; i++) some |= M.dof_damping[i] > 0;
+  return IMPLICIT && some;
+}
 // mj_EulerSkip and mj_implicitSkip of implicitfast: newton has added what damps implicitly.
 DEV void euler(const Team& t, const Model& M, State& s, bool last) {
   const int lane = t.lane;
   forward(t, M, s);
   const real* more = &s.direction[0].x[0];
-  EACH(i, NV) s.qvel[i] += M.timestep * (s.qacc_warmstart[i] + (IMPLICIT ? more[i] : real(0)));
+  const bool damps = is_damped(M);
+  EACH(i, NV) s.qvel[i] += M.timestep * (s.qacc_warmstart[i] + (damps ? more[i] : real(0)));
   t.sync();
   if (last) report(t, M, s);
   advance(t, M, s, s.qpos, s.qvel, M.timestep);
