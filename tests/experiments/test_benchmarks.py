@@ -57,6 +57,7 @@ def test_few_episodes_have_calls_of_their_own():
     """The last call of few episodes stands beside an earlier one of many."""
     few = GPU | {"date": "2026-11-24T14:00:00", "batch": 1, "env_steps_per_second": [5e3]}
     raw = tables.last_calls([GPU, few, few | {"engine": "MuJoCo Warp"}])
+    assert "| 2.00e6 | 512 x 20 |  |  |  |" in tables.gpu(raw)  # not beside one world of Warp
     assert [row["batch"] for row in raw.gpu] == [512, 1, 1]
     assert "| Hopper-v5 | 1 | 0.2 | 0.2 | 1.0 |" in tables.latency(raw)
     assert tables.rate(tables.best(raw.gpu, "Hopper-v5", "native")) == "2.00e6"

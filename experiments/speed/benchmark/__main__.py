@@ -292,8 +292,9 @@ def on_gpu(task: str, settings: Settings) -> Callable[[], list[Candidate]]:
     others = rollouts(task, "plain MJX", plain, sizes.mjx_steps) if plain else []
     worlds = settings.batches or (*sizes.few, *sizes.warp)
     if worlds:
-        others.append(c_mujoco(task))
         added(task, 128)  # compiles
+    if sizes.warp:
+        others.append(c_mujoco(task))
 
     def candidates() -> list[Candidate]:
         batches = [max(1, batch // settings.shrink) for batch in (*sizes.few, sizes.batch)]

@@ -74,12 +74,15 @@ def best(
       engine: its name.
       precision: of the row, if given.
       trained: whether a trained policy plays.
-      batch: how many episodes or worlds, if given.
+      batch: how many episodes or worlds; by default any number that is not of ``SMALL``.
     """
     fit = [row for row in rows if row["task"] == task and row["engine"] == engine]
     fit = [row for row in fit if precision in ("", row["precision"])]
     fit = [row for row in fit if (row["what"] == TRAINED) == trained]
-    fit = [row for row in fit if batch in (None, row["batch"])]
+    if batch is None:
+        fit = [row for row in fit if row["batch"] not in SMALL]
+    else:
+        fit = [row for row in fit if row["batch"] == batch]
     return max(fit, key=speed, default=None)
 
 
@@ -104,6 +107,11 @@ def times(x: float) -> str:
 def at(row: dict[str, Any] | None) -> str:
     """Returns a row's episodes or worlds and their steps: "33,792 x 200"."""
     return "" if row is None else f"{row['batch']:,} x {row['steps']}"
+
+
+def card(row: dict[str, Any] | None) -> str:
+    """Returns the model of a row's GPU: "H200"."""
+    return "" if row is None else row["device"].split()[1]
 
 
 def tasks_of(rows: list[dict[str, Any]]) -> list[str]:
@@ -152,8 +160,9 @@ def readme(raw: Raw) -> str:
     on_cpu, equal = (best(raw.cpu, FEW[2], "native", x) for x in ("float32", "float64"))
     other = best(raw.cpu, FEW[2], "C MuJoCo")
     return textwrap.fill(
-        f"On one H100, HalfCheetah runs {rate(on_gpu)} env steps per second, {ratio(on_gpu, warp)} "
-        f"times as many as in MuJoCo Warp. On two CPU cores, it runs {rate(on_cpu)}, "
+        f"On one {card(on_gpu)}, HalfCheetah runs {rate(on_gpu)} env steps per second, "
+        f"{ratio(on_gpu, warp)} times as many as in MuJoCo Warp. On two CPU cores, it runs "
+        f"{rate(on_cpu)}, "
         f"{ratio(on_cpu, other)} times as many as in C MuJoCo ({ratio(equal, other)} in float64).",
         110,
     )
@@ -184,8 +193,7 @@ def gpu(raw: Raw) -> str:
         native, warp, plain = (
             best(raw.gpu, task, engine) for engine in ("native", "MuJoCo Warp", "plain MJX")
         )
-        card = "" if native is None else native["device"].split()[1]
-        cells = (short(task), card, rate(native), at(native), rate(warp), rate(plain))
+        cells = (short(task), card(native), rate(native), at(native), rate(warp), rate(plain))
         rows.append((*cells, ratio(native, warp)))
     header = ("task", "on", "native", "episodes x steps", "MuJoCo Warp", "plain MJX")
     return f"{origin(raw.gpu)}\n\n{table((*header, 'native / Warp'), rows)}"
