@@ -484,7 +484,8 @@ class InBatch(Env):
         start_fields = [jnp.asarray(x, real) for x in start.values()]
         results = begin(is_used, *start_fields, *self._model_fields(episode))
         physics, view, _ = self._simulated(results, episode)
-        physics = physics.replace(**recollect_start(self.env, rng, view)._asdict())
+        recollection = recollect_start(self.env, rng, view)
+        physics = dataclasses.replace(physics, **recollection._asdict())
         zero = jnp.zeros((), real)
         action = jnp.zeros(self.action_size, real)
         terms = self._outcome(self._before(physics), view, action)[2]
@@ -518,7 +519,7 @@ class InBatch(Env):
         results = self._step_call(is_used, *inputs, *self._model_fields(before.episode))
         physics, view, sound = self._simulated(results, before.episode)
         recollection = recollect_step(self.env, before, view, action)
-        physics = physics.replace(**recollection._asdict())
+        physics = dataclasses.replace(physics, **recollection._asdict())
         reward, terminated, terms = self._outcome(before_view, view, action)
         dtype = state.reward.dtype
         return dataclasses.replace(
@@ -541,7 +542,7 @@ class InBatch(Env):
         state, sound, *values = results
         fields = dict(zip(self._simulations.fields, values, strict=True))
         carried = {name: fields[name] for name in self._carried} | {STATE: state}
-        common = {name: fields[name] for name in models.CARRIED}
+        common: dict[str, Any] = {name: fields[name] for name in models.CARRIED}
         physics = Physics(**common, carried=carried, episode=episode, constants={})
         return physics, Before(fields, self.env.mj_model, episode), sound
 

@@ -1,6 +1,6 @@
 """What an env step hands to the next, and what a task knows of its start."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -88,7 +88,7 @@ def recollect_start(env: Any, rng: jax.Array | None, view: Any) -> Recollection:
     if rng is None:
         rng = jax.random.key(0)
     # Two words, whatever generator the key is of.
-    key, memory_key = jax.random.split(key_of_words(jax.random.bits(rng, 2, jnp.uint32)))
+    key, memory_key = jax.random.split(key_of_words(jax.random.bits(rng, (2,), jnp.uint32)))
     memory = check_memory(type(env).__name__, "memory", env.memory(memory_key, view))
     # A copy, here and below: a task may change entries of the dict that it reads.
     view.memory = dict(memory)
@@ -109,7 +109,7 @@ def recollect_step(
     """
     if not env.has_memory:
         return NOTHING
-    key, step_key = jax.random.split(key_of_words(before.key))
+    key, step_key = jax.random.split(key_of_words(cast(jax.Array, before.key)))
     view.memory = dict(before.memory)
     entries = env.remember(step_key, view, action)
     memory = check_memory(type(env).__name__, "remember", entries, before.memory)
