@@ -455,9 +455,12 @@ class InBatch(Env):
 
     def reset_where(self, rng: jax.Array, is_used: jax.Array) -> State:
         """Does as ``reset`` where an episode is to begin []; else what it returns means nothing."""
-        memory_rng, rng = self.env.split_rng(rng)
-        episode, start = self.env.draw(rng)
-        return self._start(start, episode, memory_rng, is_used)
+        memory_rng, draw_rng = self.env.split_rng(rng)
+        episode, start = self.env.draw(draw_rng)
+        # As many simulations begin as there are keys, also where nothing is drawn: the batch that
+        # steps them is the one that knows which of their bodies sleep.
+        words = jax.random.key_data(rng)
+        return self._start(start, episode, memory_rng, is_used & jnp.all(words == words))
 
     def set_state(
         self,

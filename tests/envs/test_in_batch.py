@@ -258,6 +258,30 @@ def test_bodies_sleep_as_in_c_and_never_for_another_episode(float64):
         jax.block_until_ready(step(first, jnp.zeros((2, 2))))
 
 
+class CalmCart(Cart):
+    """All of its episodes start alike, and the box is pushed after a while."""
+
+    def initial(self, rng):
+        return jnp.asarray(self.mj_model.qpos0), jnp.zeros(self.mj_model.nv).at[0].set(0.1)
+
+    def memory(self, rng, data):
+        return {"step": 0}
+
+    def remember(self, rng, data, action):
+        return {"step": data.memory["step"] + 1}
+
+    def push(self, before):
+        return jnp.zeros(self.mj_model.nv).at[-6].set(before.memory["step"] == 150)
+
+
+def test_a_body_that_sleeps_wakes_where_it_is_pushed(float64):
+    keys, actions = jax.random.split(jax.random.key(1), 2), np.zeros((155, 2, 2))
+    envs = [CalmCart(**SLEEP), CalmCart(**SLEEP | {"size": ""})]
+    asleep, awake = (stepped(env.in_c_mujoco(), keys, actions)[0] for env in envs)
+    np.testing.assert_allclose(asleep, awake, rtol=0, atol=1e-3)
+    assert np.abs(awake[150] - awake[155]).max() > 1e-3
+
+
 def test_a_sweep_trains_what_mjx_refuses():
     """Its programs are built with traced settings, for which no engine plays."""
     config = Config(num_episodes=2, eval_episodes=1, horizon=5, hidden_sizes=(2,))
