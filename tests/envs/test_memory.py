@@ -158,6 +158,7 @@ def test_one_episode_in_c_mujoco_is_that_of_the_task(env):
         np.testing.assert_allclose(reward, state.reward, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_action_comes_late_and_the_last_one_is_observed(env):
     step = jax.jit(env.step)
     states = [jax.jit(env.reset)(jax.random.key(0))]
@@ -308,6 +309,7 @@ class Counting(Pushed):
         return data.memory["array"][0] - before.memory["array"][0], False, {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["vmap", "mujoco", "InMujoco"])
 def test_a_task_may_change_the_dict_that_it_reads(engine):
     """What it changes there is neither what ``outcome`` sees of before, nor what comes next."""

@@ -177,6 +177,7 @@ def test_machine_code_starts_there_too(float64):
         np.testing.assert_allclose(observations[engine], observations["vmap"], atol=1e-7)
 
 
+@pytest.mark.slow
 def test_set_state_takes_the_same_fields(float64):
     env = Finger("closed")
     qpos, qvel = jnp.array([0.1, 0.2]), jnp.zeros(2)
@@ -238,6 +239,7 @@ class Servo(Finger):
         return self.home + SCALE * action
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["vmap", "mujoco"])
 def test_an_action_applies_its_control(float64, engine):
     env = Servo()

@@ -118,6 +118,7 @@ def of(name):
     return model, data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_sensors_show_what_those_of_c_show(name):
     model, data = of(name)

@@ -145,6 +145,7 @@ def _error(m, play, fields, numbers):
     return max(errors), touched
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", _OPTIONS)
 def test_numbers_of_the_model_itself_are_those_of_its_tables(options):
     m = _walker(options)
