@@ -4,6 +4,7 @@ A team has the tables that depend on such fields in its state. The program of a 
 entries from what ``MujocoEnv.randomize`` drew, and from what MuJoCo derives of that.
 """
 
+import enum
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any, TypeAlias
 
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_reinforce.engine.team import flags
+from mjx_reinforce.engine.team import flags, records
 from mjx_reinforce.engine.team.contact_kinds import MIN_VALUE
 from mjx_reinforce.engine.team.frames import rotation, times
 from mjx_reinforce.engine.team.supported import SLIDE, GeomPair
@@ -24,8 +25,18 @@ INERTIAL = _OF_LINKS | {"dof_armature"}
 #: The entries of a symmetric matrix that ``frames.six`` returns.
 _ROWS = np.array([0, 1, 2, 0, 0, 1])
 _COLUMNS = np.array([0, 1, 2, 1, 2, 2])
-#: Parts of tables by the name of a table and the first column, each [rows, columns].
-Entries: TypeAlias = dict[tuple[str, int], Any]
+#: Parts of tables by the name of a table and the field of ``records.FIELDS`` that they begin at, ""
+#: where a row has none, each [rows, columns].
+Entries: TypeAlias = dict[tuple[str, str], Any]
+
+
+class Mix(enum.IntEnum):
+    """Which geom's friction a contact has: the Mix of ``device/draws.h``."""
+
+    LARGER = 0
+    OF_FIRST = 1
+    OF_SECOND = 2
+    OF_PAIR = 3
 
 
 def effective(model: Any, random: Collection[str]) -> frozenset[str]:
@@ -51,16 +62,16 @@ def entries(tables: Any, random: Collection[str], fields: Mapping[str, Any]) -> 
     # Degrees of freedom inherit armature and damping of actuators, too.
     for field in {"dof_armature", "dof_damping"}.intersection(random):
         inherited = tables.reals[field] - getattr(tables.model, field)
-        parts[field, 0] = (getattr(model, field) + inherited)[:, None]
+        parts[field, ""] = (getattr(model, field) + inherited)[:, None]
     if "jnt_stiffness" in random:
         joint = tables.dof_joint
         is_single = tables.model.jnt_type[joint] >= SLIDE
         stiffness = model.jnt_stiffness[joint]
-        parts["dof_stiffness", 0] = jnp.where(is_single, stiffness, 0)[:, None]
-        parts["dof_law", 0] = jnp.where(is_single, 0, stiffness)[:, None]
+        parts["dof_stiffness", ""] = jnp.where(is_single, stiffness, 0)[:, None]
+        parts["dof_law", "stiffness"] = jnp.where(is_single, 0, stiffness)[:, None]
     parts |= _actuators(tables, model, random)
     if "geom_friction" in random:
-        parts["geom_friction", 0] = model.geom_friction[tables.geoms]
+        parts["geom_friction", ""] = model.geom_friction[tables.geoms]
     return {key: part for key, part in parts.items() if np.size(tables.reals[key[0]])}
 
 
@@ -107,28 +118,28 @@ def _bodies(tables: Any, model: Any, random: Collection[str]) -> Entries:
     is_shared = bool((is_of_link @ (1 + (tables.model.body_mass == 0)) > 1).any())
     parts: Entries = {}
     if has_mass:
-        parts["body_mass", 0] = mass[:, None]
-        parts["link_mass", 0] = link_mass[:, None]
+        parts["body_mass", ""] = mass[:, None]
+        parts["link_mass", ""] = link_mass[:, None]
     if has_moment:
-        parts["body_inertia", 0] = inertia
+        parts["body_inertia", ""] = inertia
     if has_center:
-        parts["body_com", 0] = com
-        parts["fluid_body", 0] = com[bodies]
+        parts["body_com", ""] = com
+        parts["fluid_body", "at"] = com[bodies]
     if has_center or (has_mass and is_shared):
-        parts["link_com", 0] = link_com
+        parts["link_com", ""] = link_com
     if has_moment or is_shared:
-        parts["link_inertia", 0] = is_of_link @ (inertia + mass[:, None] * shift)
+        parts["link_inertia", ""] = is_of_link @ (inertia + mass[:, None] * shift)
     if has_mass or has_center:
         compensated = np.array(tables.ints["compensated_link"], int)
-        parts["compensated", 0] = is_of_link[compensated] @ held
+        parts["compensated", "moment"] = is_of_link[compensated] @ held
     if has_mass or has_moment:
-        columns = fluid(jnp, model, bodies)
-        parts |= {("fluid_body", column): part for column, part in columns.items()}
+        resistances = fluid(jnp, model, bodies)
+        parts |= {("fluid_body", field): part for field, part in resistances.items()}
     return parts
 
 
-def fluid(xp: Any, model: Any, bodies: np.ndarray) -> dict[int, Any]:
-    """Returns columns of the FluidBody of ``device/records.h`` that depend on masses and inertias.
+def fluid(xp: Any, model: Any, bodies: np.ndarray) -> dict[str, Any]:
+    """Returns the fields of a FluidBody of ``records.py`` that depend on masses and inertias.
 
     Args:
       xp: NumPy, or that of JAX.
@@ -145,10 +156,10 @@ def fluid(xp: Any, model: Any, bodies: np.ndarray) -> dict[int, Any]:
     others = box[:, np.array([[1, 2], [0, 2], [0, 1]])]
     opt = model.opt
     return {
-        12: np.pi * opt.viscosity * diameter**3,
-        13: 3 * np.pi * opt.viscosity * diameter,
-        14: opt.density / 64 * box * (others**4).sum(2),
-        17: opt.density / 2 * others.prod(2),
+        "viscous_torque": np.pi * opt.viscosity * diameter**3,
+        "viscous_force": 3 * np.pi * opt.viscosity * diameter,
+        "drag_torque": opt.density / 64 * box * (others**4).sum(2),
+        "drag_force": opt.density / 2 * others.prod(2),
     }
 
 
@@ -168,23 +179,27 @@ def _weights(tables: Any, model: Any) -> Entries:
     connected = np.array(tables.ints["connect_body"], int).reshape(-1, 2)
     parts: Entries = {}
     if tables.constants["LIMITS"]:
-        parts["dof_limit", 3] = dof_weight
+        parts["dof_limit", "weight"] = dof_weight
     if tables.constants["LOSSES"]:
-        parts["dof_loss", 1] = dof_weight
+        parts["dof_loss", "weight"] = dof_weight
     return parts | {
-        ("body_weight", 0): body_weight,
-        ("connect_weight", 0): body_weight[connected].sum(1),
-        ("joined_weight", 0): ((joined >= 0)[:, :, None] * dof_weight[joined]).sum(1),
-        ("bound", 3): jnp.concatenate(bound_weights),
+        ("body_weight", ""): body_weight,
+        ("connect_weight", ""): body_weight[connected].sum(1),
+        ("joined_weight", ""): ((joined >= 0)[:, :, None] * dof_weight[joined]).sum(1),
+        ("bound", "weight"): jnp.concatenate(bound_weights),
     }
 
 
-def mix(model: Any, pair: GeomPair) -> int:
-    """Returns the Mix of ``device/draws.h`` of a pair of geoms."""
+def mix(model: Any, pair: GeomPair) -> Mix:
+    """Returns which friction the contacts of a pair of geoms have (mj_contactParam)."""
     if pair.pair >= 0:
-        return 3
+        return Mix.OF_PAIR
     first, second = model.geom_priority[[pair.geom1, pair.geom2]]
-    return 0 if first == second else 1 if first > second else 2
+    if first == second:
+        return Mix.LARGER
+    if first > second:
+        return Mix.OF_FIRST
+    return Mix.OF_SECOND
 
 
 def _actuators(tables: Any, model: Any, random: Collection[str]) -> Entries:
@@ -195,13 +210,13 @@ def _actuators(tables: Any, model: Any, random: Collection[str]) -> Entries:
     has_bias = model.actuator_biastype[:, None] == _C.mjtBias.mjBIAS_AFFINE
     parts: Entries = {}
     if "actuator_gear" in random:
-        parts["actuator", 0] = model.actuator_gear[order, :1]
+        parts["actuator", "gear"] = model.actuator_gear[order, :1]
     if "actuator_gainprm" in random:
         gain = is_enabled * model.actuator_gainprm[:, :3]
-        parts["actuator", 3] = gain[order, :1]
-        parts["actuator", 9] = (is_affine * gain[:, 1:])[order]
+        parts["actuator", "gain"] = gain[order, :1]
+        parts["actuator", "gain_by_length"] = (is_affine * gain[:, 1:])[order]
     if "actuator_biasprm" in random:
-        parts["actuator", 4] = (is_enabled * has_bias * model.actuator_biasprm[:, :3])[order]
+        parts["actuator", "bias"] = (is_enabled * has_bias * model.actuator_biasprm[:, :3])[order]
     return parts
 
 
@@ -219,13 +234,14 @@ class Layout:
         self.starts: dict[str, int] = {}
         self.base: list[float] = []
         self.places: list[int] = []
-        for (name, column), part in sorted(shapes.items()):
+        for (name, field), part in sorted(shapes.items()):
             numbers = np.asarray(tables.reals[name], float).ravel()
             if name not in self.starts:
                 self.starts[name] = len(self.base)
                 self.base += numbers.tolist()
             rows, columns = part.shape
-            spots = np.arange(len(numbers)).reshape(rows, -1)[:, column : column + columns]
+            first = records.column(name, field)
+            spots = np.arange(len(numbers)).reshape(rows, -1)[:, first : first + columns]
             self.places += (self.starts[name] + spots).ravel().tolist()
 
 

@@ -79,6 +79,15 @@ def size(type_name: str) -> int:
     return sum(FIELDS.get(type_name, {"": 1}).values())
 
 
+def column(table: str, field: str) -> int:
+    """Returns the first column of a field of a table's rows; 0 of a table without fields, ""."""
+    if not field:
+        return 0
+    field_sizes = FIELDS[STRUCTS[table]]
+    names = list(field_sizes)
+    return sum(field_sizes[name] for name in names[: names.index(field)])
+
+
 def packed(low: int, high: int) -> int:
     """Returns the Pair of ``device/records.h``."""
     return low | high << 16

@@ -682,7 +682,7 @@ class _Tables:
         item_kinds = []
         weights = []
         for pair, kind in pairs:
-            mix = draws.mix(model, pair) if has_friction else 0
+            mix = draws.mix(model, pair) if has_friction else draws.Mix.LARGER
             number = kind_numbers.setdefault((kind, mix), len(kind_numbers))
             bodies = model.geom_bodyid[[pair.geom1, pair.geom2]]
             weight = sum(model.body_invweight0[body, 0] for body in bodies)

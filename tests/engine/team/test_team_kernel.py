@@ -126,10 +126,10 @@ def test_teams_play_the_same_episodes(teams, name):
     np.testing.assert_array_equal(got.simulated, got.mask.sum((1, 2)))
 
 
-@pytest.mark.slow
-def test_teams_show_sensors(teams):
+def as_without_teams(teams, task, steps):
+    """Returns the episodes of a leg that machine code plays on the CPU; teams play the same."""
     spec = mujoco.MjSpec.from_string(LEG)
-    env = Leg(xml_file=spec, frame_skip=2, max_episode_steps=60, reward_threshold=None)
+    env = task(xml_file=spec, frame_skip=2, max_episode_steps=steps, reward_threshold=None)
     player = actor_and_act(env, (5,))
     want = played(native.native_rollout, env, player, num_seeds=2)
     made = teams()
@@ -138,6 +138,12 @@ def test_teams_show_sensors(teams):
     for name in ("observation", "reward"):
         pair = (getattr(x, name)[:, :20] for x in (got, want))
         np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
+    return want
+
+
+@pytest.mark.slow
+def test_teams_show_sensors(teams):
+    want = as_without_teams(teams, Leg, 60)
     assert (want.observation[..., 9] > 0).any()  # touch
 
 
@@ -161,16 +167,7 @@ def test_teams_play_models_that_differ_from_episode_to_episode(teams):
 
 @pytest.mark.slow
 def test_teams_play_episodes_that_remember(teams):
-    spec = mujoco.MjSpec.from_string(LEG)
-    env = RememberingLeg(xml_file=spec, frame_skip=2, max_episode_steps=40, reward_threshold=None)
-    player = actor_and_act(env, (5,))
-    want = played(native.native_rollout, env, player, num_seeds=2)
-    made = teams()
-    got = played(native.native_rollout, env, player, num_seeds=2)
-    assert {kernel.launch.lanes for kernel in made} == {16}
-    for name in ("observation", "reward"):
-        pair = (getattr(x, name)[:, :20] for x in (got, want))
-        np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
+    want = as_without_teams(teams, RememberingLeg, 40)
     np.testing.assert_allclose(
         want.observation[:, 1:20, :, -3], want.action[:, :19, :, 0], atol=1e-6
     )

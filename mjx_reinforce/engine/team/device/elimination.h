@@ -40,7 +40,10 @@ DEV void solve(const Team& t, State& s, Rows& h, real (&p)[ROWS_A_LANE]) {
         flat[m * STRIDE + i] = u[r];
         flat[(m + 1) * STRIDE + i] = w[r];
       }
-      if (ROWS_A_LANE > 1 && i == SIDE) right_side[m] = u[r], right_side[m + 1] = w[r];
+      if (ROWS_A_LANE > 1 && i == SIDE) {
+        right_side[m] = u[r];
+        right_side[m + 1] = w[r];
+      }
     }
     UNROLL for (int q = (m + 2) / 4; q < (SIDE + (ROWS_A_LANE > 1) + 3) / 4; q++) {
       const Quad a = s.columns[m / 2 % 2][0][q], b = s.columns[m / 2 % 2][1][q];
