@@ -34,7 +34,6 @@ from mjx_reinforce.envs.outcomes import (
     check_push,
     check_start,
 )
-from mjx_reinforce.envs.parts import View
 from mjx_reinforce.envs.settings import EpisodeSettings, build_settings
 from mjx_reinforce.envs.starts import MOCAP, at_rest, key_frame, start_shapes
 from mjx_reinforce.envs.state import (
@@ -44,6 +43,7 @@ from mjx_reinforce.envs.state import (
     recollect_start,
     recollect_step,
 )
+from mjx_reinforce.envs.views import View
 
 #: A forward pass of C MuJoCo 4.0.
 _forward = mjx_internals.fenced(physics.forward)
@@ -156,7 +156,7 @@ class MujocoEnv(Env):
           before: the simulation at the start of the env step. It has time, qpos, qvel, act, and
             the fields in ``carried``: "ctrl" there is what was applied in the env step before.
           data: the simulation after the env step; it has every field of mjData, parts by their
-            names, as ``data.site("tip").xpos`` (see ``parts.Named``), and ``data.episode``.
+            names, as ``data.site("tip").xpos`` (see ``views.Named``), and ``data.episode``.
           action: [A] as the policy gave it.
         """
 

@@ -28,9 +28,9 @@ from mjx_reinforce.engine.cpu.host import HostCall, HostFunction, Spec
 from mjx_reinforce.engine.memory import gigabytes, host_memory, num_cores
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.outcomes import check_control, check_outcome, check_push
-from mjx_reinforce.envs.parts import Named
 from mjx_reinforce.envs.starts import MOCAP, start_shapes
 from mjx_reinforce.envs.state import Before, Physics, recollect_start, recollect_step
+from mjx_reinforce.envs.views import Named
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco

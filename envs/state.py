@@ -10,7 +10,7 @@ from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
 from mjx_reinforce.engine.play.counter import key_of_words
 from mjx_reinforce.envs.outcomes import check_memory
-from mjx_reinforce.envs.parts import Named
+from mjx_reinforce.envs.views import Named
 
 
 @struct.dataclass(kw_only=True)
