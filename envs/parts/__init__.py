@@ -8,18 +8,32 @@ from mjx_reinforce.envs.parts.changes import command, is_due, push, push_velocit
 from mjx_reinforce.envs.parts.delays import append, delayed, history
 from mjx_reinforce.envs.parts.noise import normal_noise, uniform_noise
 from mjx_reinforce.envs.parts.rewards import action_rate, effort, tracking, upright, weighted
+from mjx_reinforce.envs.parts.variation import (
+    actuators,
+    armature,
+    centers,
+    damping,
+    friction,
+    masses,
+)
 
 __all__ = [
     "action_rate",
+    "actuators",
     "angular_velocity",
     "append",
+    "armature",
+    "centers",
     "command",
+    "damping",
     "delayed",
     "effort",
+    "friction",
     "gravity",
     "history",
     "is_due",
     "linear_velocity",
+    "masses",
     "normal_noise",
     "push",
     "push_velocity",

@@ -16,7 +16,7 @@ def tracking(error: ArrayLike, width: float) -> jax.Array:
     """Returns exp(-|error|^2 / width^2) []: 1 without an error, 0.37 where it is the width.
 
     This is the term of Rudin et al., Learning to Walk in Minutes Using Massively Parallel Deep
-    Reinforcement Learning, 2022; legged_gym calls width^2 ``tracking_sigma``, which is 0.25.
+    Reinforcement Learning, 2022; legged_gym calls width^2 tracking_sigma, which is 0.25.
 
     Args:
       error: [] or [n] the distance from a command (m/s, rad/s).
@@ -66,5 +66,5 @@ def weighted(
     missing = [f"no weight for the term {name!r}" for name in terms if name not in weights]
     missing += [f"no term for the weight {name!r}" for name in weights if name not in terms]
     require(not missing, f"weights and terms need the same names: {', '.join(missing)}")
-    products = {f"reward_{name}": weights[name] * term for name, term in terms.items()}
+    products = {f"reward_{name}": weights[name] * jnp.asarray(term) for name, term in terms.items()}
     return jnp.sum(jnp.stack([*products.values()])), products

@@ -9,34 +9,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from robot import ROBOT, Robot
 
-from mjx_reinforce.envs import parts
+from mjx_reinforce.engine import rollout
+from mjx_reinforce.envs import models, parts
+from mjx_reinforce.envs.in_mujoco import InMujoco
 from mjx_reinforce.envs.state import Before
 
-ROBOT = """
-<mujoco>
-  <option gravity="0 0 -9"/>
-  <worldbody>
-    <geom name="floor" type="plane" size="0 0 1"/>
-    <body name="trunk" pos="0 0 0.4" simple="false">
-      <freejoint/>
-      <geom type="box" size="0.1 0.07 0.05" pos="0.01 0 0.02"/>
-      <body name="leg" pos="0.1 0 0">
-        <joint name="hip" axis="0 1 0" damping="0.3" armature="0.01"/>
-        <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.03" friction="0.7 0.01 0.001"/>
-        <body pos="0 0 -0.2">
-          <joint name="knee" axis="0 1 0" damping="0.3" armature="0.01"/>
-          <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02"/>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <position joint="hip" kp="20" kv="0.5" ctrlrange="-1 1" forcerange="-8 8"/>
-    <motor joint="knee" gear="5" ctrlrange="-1 1"/>
-  </actuator>
-</mujoco>
-"""
 KEYS = jax.random.split(jax.random.key(0), 2000)
 
 
@@ -182,3 +161,171 @@ def test_a_reward_is_the_sum_of_weighted_terms():
     message = "the same names: no weight for the term 'rate', no term for the weight 'tilt'"
     with pytest.raises(ValueError, match=re.escape(message)):
         parts.weighted(wrong, {"track": 1.0, "rate": 1.0})
+
+
+def fields_of(draw, model, *arguments, **options):
+    """Returns the fields of the model in many draws, each [N, ...] as in mjModel."""
+    fields = drawn(draw, model, *arguments, **options)
+    for name, samples in fields.items():
+        assert name in models.RANDOM
+        assert samples.shape[1:] == getattr(model, name).shape
+    return {name: np.asarray(samples, float) for name, samples in fields.items()}
+
+
+def test_all_geoms_have_the_friction_that_is_drawn(model):
+    coefficients = fields_of(parts.friction, model, 0.4, 1.0)["geom_friction"]
+    assert_uniform(coefficients[:, 0, 0], 0.4, 1.0)
+    np.testing.assert_array_equal(np.ptp(coefficients[..., 0], axis=1), 0)
+    np.testing.assert_allclose(coefficients[0, :, 1:], model.geom_friction[:, 1:], rtol=1e-6)
+
+
+def test_a_body_with_another_mass_is_one_of_another_density(model):
+    fields = fields_of(parts.masses, model, 0.9, 1.1)
+    factors = fields["body_mass"][:, 1:] / model.body_mass[1:]
+    assert_uniform(factors, np.full(3, 0.9), np.full(3, 1.1))
+    assert np.abs(np.corrcoef(factors.T) - np.eye(3)).max() < 0.1
+    # MuJoCo computes them from the geoms of a model with another density.
+    first = model.geom("floor").id + 1
+    spec = mujoco.MjSpec.from_string(ROBOT)
+    for geom, factor in zip(spec.geoms[first:], factors[0], strict=True):
+        geom.density = 1000 * factor
+    expected = spec.compile()
+    np.testing.assert_allclose(fields["body_mass"][0], expected.body_mass, rtol=1e-5)
+    np.testing.assert_allclose(fields["body_inertia"][0], expected.body_inertia, rtol=1e-5)
+
+
+def test_the_center_of_the_root_moves_and_no_other(model):
+    width = np.array([0.05, 0.02, 0.0])
+    shifts = fields_of(parts.centers, model, width)["body_ipos"] - model.body_ipos
+    assert_uniform(shifts[:, 1, :2], -width[:2], width[:2])
+    np.testing.assert_allclose(np.delete(shifts, 1, axis=1), 0, atol=1e-8)
+    np.testing.assert_allclose(shifts[:, 1, 2], 0, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("part", "field"), [(parts.armature, "dof_armature"), (parts.damping, "dof_damping")]
+)
+def test_joints_differ(model, part, field):
+    samples = fields_of(part, model, 0.5, 1.5)[field]
+    assert_uniform(samples[:, 6:] / getattr(model, field)[6:], [0.5, 0.5], [1.5, 1.5])
+    assert not samples[:, :6].any()
+
+
+#: A position servo, a motor, a velocity servo, and a servo of gains that do not belong together.
+ACTUATORS = """
+    <velocity joint="knee" kv="3"/>
+    <general joint="hip" gainprm="2" biastype="affine" biasprm="0.5 -20 -0.4"/>
+  </actuator>"""
+#: What is multiplied of gain, constant, angle and speed, of each actuator.
+MULTIPLIED = {
+    "stiffness": ["gain angle", "", "", "gain angle"],
+    "damping": ["speed", "", "gain speed", "speed"],
+    "strength": ["gain angle speed", "gain", "gain speed", "gain constant angle speed"],
+}
+
+
+@pytest.mark.parametrize("quantity", MULTIPLIED)
+def test_actuators_differ_in_what_belongs_together(quantity):
+    model = mujoco.MjModel.from_xml_string(ROBOT.replace("</actuator>", ACTUATORS))
+    fields = fields_of(parts.actuators, model, **{quantity: (0.5, 1.5)})
+    gains, biases = fields["actuator_gainprm"], fields["actuator_biasprm"]
+    assert not gains[..., 1:].any()
+    assert not biases[..., 3:].any()
+    samples = np.concatenate([gains[..., :1], biases[..., :3]], axis=-1)
+    unchanged = np.c_[model.actuator_gainprm[:, 0], model.actuator_biasprm[:, :3]]
+    all_factors = []
+    for number, words in enumerate(MULTIPLIED[quantity]):
+        is_multiplied = np.isin(["gain", "constant", "angle", "speed"], words.split())
+        assert np.all(unchanged[number][is_multiplied])
+        factors = samples[:, number, is_multiplied] / unchanged[number][is_multiplied]
+        rest = np.broadcast_to(unchanged[number][~is_multiplied], (len(KEYS), sum(~is_multiplied)))
+        np.testing.assert_allclose(samples[:, number, ~is_multiplied], rest, rtol=1e-6)
+        if words:
+            np.testing.assert_allclose(factors, factors[:, :1].repeat(sum(is_multiplied), 1))
+            assert_uniform(factors[:, 0], 0.5, 1.5)
+            all_factors.append(factors[:, 0])
+    assert np.abs(np.corrcoef(all_factors) - np.eye(len(all_factors))).max() < 0.1
+
+
+def test_actuators_without_ranges_are_the_model(model):
+    for name, field in parts.actuators(KEYS[0], model).items():
+        np.testing.assert_allclose(field, getattr(model, name), rtol=1e-6)
+
+
+def test_a_muscle_is_refused():
+    text = ROBOT.replace("</actuator>", '<muscle joint="hip" lengthrange="0 1"/></actuator>')
+    model = mujoco.MjModel.from_xml_string(text)
+    with pytest.raises(ValueError, match=r"varies motors and servos.* yourself for these: 2$"):
+        parts.actuators(KEYS[0], model)
+
+
+def test_no_two_parts_write_the_same_field(model):
+    """Joined by ``|``, one would be lost."""
+    key = KEYS[0]
+    ranges = [part(key, model, 0.9, 1.1) for part in (parts.friction, parts.masses)]
+    ranges += [part(key, model, 0.9, 1.1) for part in (parts.armature, parts.damping)]
+    ranges += [parts.centers(key, model, 0.1), parts.actuators(key, model)]
+    fields = [name for drawn_fields in ranges for name in drawn_fields]
+    assert len(fields) == len({*fields}) == 8
+
+
+STEPS = 12
+
+
+class Fixed:
+    """No noise: the policy's output is the action."""
+
+    def noise(self, key, shape):
+        return jnp.zeros((*shape, 2))
+
+    def sample(self, outputs, noise):
+        return outputs
+
+    mode = staticmethod(lambda outputs: outputs)
+
+
+def act(params, observation):
+    """Returns an action that depends on all that is observed."""
+    return jnp.tanh(observation @ params)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return Robot()
+
+
+def params_of(env):
+    return np.linspace(-1, 1, 2 * env.observation_size).reshape(-1, 2)
+
+
+def played(engine, env):
+    """Returns the observations [T, N, O] and rewards [T, N] that an engine plays."""
+    params = jnp.asarray(params_of(env), jnp.result_type(float))
+    options = {"num_episodes": 6, "horizon": STEPS, "engine": engine}
+    trajectory = jax.jit(lambda params, key: rollout(env, act, params, Fixed(), key, **options))(
+        params, jax.random.key(3)
+    )
+    return np.asarray(trajectory.observation), np.asarray(trajectory.reward)
+
+
+@pytest.mark.slow
+def test_all_engines_play_a_task_of_all_parts(robot):
+    by_vmap = played("vmap", robot)
+    assert len(np.unique(by_vmap[0][0, :, -1])) >= 4  # commands, some of which are 0
+    for engine in ("native", "mujoco"):
+        for other, expected in zip(played(engine, robot), by_vmap, strict=True):
+            np.testing.assert_allclose(other, expected, rtol=0, atol=2e-5)
+
+
+@pytest.mark.slow
+def test_one_episode_in_c_mujoco_is_that_of_the_task(robot):
+    key = jax.random.key(5)
+    simulation = InMujoco(robot)
+    state, step = jax.jit(robot.reset)(key), jax.jit(robot.step)
+    np.testing.assert_allclose(simulation.reset(key), state.obs, atol=1e-6)
+    for _ in range(STEPS):
+        action = np.asarray(act(params_of(robot), state.obs), np.float32)
+        state = step(state, action)
+        observation, reward, _ = simulation.step(action)
+        np.testing.assert_allclose(observation, state.obs, atol=3e-5)
+        np.testing.assert_allclose(reward, state.reward, atol=1e-5)
