@@ -17,7 +17,7 @@ from gymnasium.envs.classic_control import CartPoleEnv
 from mjx_reinforce import envs
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import Before
-from mjx_reinforce.envs.parts import View
+from mjx_reinforce.envs.views import View
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date")
 
