@@ -40,6 +40,7 @@ from mjx_reinforce.envs.state import (
     Before,
     Physics,
     Recollection,
+    observed,
     recollect_start,
     recollect_step,
 )
@@ -106,6 +107,9 @@ class MujocoEnv(Env):
     #: Whether ``outcome`` or ``observe`` reads ``cfrc_ext``, which is zero at the start of an
     #: episode, as in Gymnasium.
     contact_forces = False
+    #: How many observations a policy sees: the last ones, the oldest first, one after the other. At
+    #: the start of an episode all are the first. A policy that runs elsewhere keeps them itself.
+    frames: int = 1
 
     def __init__(self, **arguments: object):
         """Compiles the model.
@@ -242,7 +246,10 @@ class MujocoEnv(Env):
         return jnp.zeros(self.mj_model.nv)
 
     def observe(self, data: View) -> jax.Array:
-        """Returns the observation [O]; by default qpos, then qvel."""
+        """Returns the observation; by default qpos, then qvel.
+
+        A policy sees the last ``frames`` of them [O], with the noise that they had.
+        """
         return jnp.concatenate([data.qpos, data.qvel])
 
     def reset(self, rng: jax.Array) -> State:
@@ -403,7 +410,8 @@ class MujocoEnv(Env):
         zero = jnp.zeros((), qpos.dtype)
         action = jnp.zeros(self.action_size, qpos.dtype)
         terms = self._outcome(self._before(state, start_data), view, action)[2]
-        return State(cast(Any, state), self.observe(view), zero, zero, dict.fromkeys(terms, zero))
+        metrics = dict.fromkeys(terms, zero)
+        return State(cast(Any, state), observed(self, view), zero, zero, metrics)
 
     def step(self, state: State, action: jax.Array) -> State:
         """Returns the state one env step later under ``action`` [A].
@@ -441,7 +449,7 @@ class MujocoEnv(Env):
             pipeline_state=self._physics(
                 data, before.episode, before.constants, mocap, recollection
             ),
-            obs=self.observe(view),
+            obs=observed(self, view, cast(jax.Array, state.obs)),
             reward=jnp.where(is_sound, jnp.asarray(reward, dtype), jnp.nan),
             done=jnp.asarray(terminated, dtype),
             metrics=state.metrics | jax.tree.map(lambda x: jnp.asarray(x, dtype), terms),
@@ -593,7 +601,7 @@ class MujocoEnv(Env):
 
     @property
     def observation_size(self) -> int:
-        """The number O of entries of an observation."""
+        """The number O of entries that a policy sees, of all ``frames``."""
         return observation_size(self)
 
     def __repr__(self) -> str:

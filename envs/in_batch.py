@@ -29,7 +29,7 @@ from mjx_reinforce.engine.memory import gigabytes, host_memory, num_cores
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.outcomes import check_control, check_outcome, check_push
 from mjx_reinforce.envs.starts import MOCAP, start_shapes
-from mjx_reinforce.envs.state import Before, Physics, recollect_start, recollect_step
+from mjx_reinforce.envs.state import Before, Physics, observed, recollect_start, recollect_step
 from mjx_reinforce.envs.views import Named
 
 #: MuJoCo's own names; it is a C extension without stubs.
@@ -493,7 +493,7 @@ class InBatch(Env):
         action = jnp.zeros(self.action_size, real)
         terms = self._outcome(self._before(physics), view, action)[2]
         metrics = dict.fromkeys(terms, zero)
-        return State(cast(Any, physics), self.env.observe(view), zero, zero, metrics)
+        return State(cast(Any, physics), observed(self.env, view), zero, zero, metrics)
 
     def step(self, state: State, action: jax.Array) -> State:
         """Returns the state one env step later under ``action`` [A].
@@ -528,7 +528,7 @@ class InBatch(Env):
         return dataclasses.replace(
             state,
             pipeline_state=physics,
-            obs=self.env.observe(view),
+            obs=observed(self.env, view, cast(jax.Array, state.obs)),
             reward=jnp.where(sound, jnp.asarray(reward, dtype), jnp.nan),
             done=jnp.asarray(terminated, dtype),
             metrics=state.metrics | jax.tree.map(lambda x: jnp.asarray(x, dtype), terms),
@@ -572,7 +572,7 @@ class InBatch(Env):
 
     @property
     def observation_size(self) -> int:
-        """The number O of entries of an observation."""
+        """The number O of entries that a policy sees."""
         return observation_size(self)
 
     @property

@@ -13,7 +13,13 @@ from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import Before, MujocoEnv
 from mjx_reinforce.envs.in_batch import FieldRecorder, read_all, spec_of
 from mjx_reinforce.envs.outcomes import check_control, check_push
-from mjx_reinforce.envs.state import NOTHING, Recollection, recollect_start, recollect_step
+from mjx_reinforce.envs.state import (
+    NOTHING,
+    Recollection,
+    observed,
+    recollect_start,
+    recollect_step,
+)
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco
@@ -60,6 +66,7 @@ class InMujoco:
         jax.eval_shape(read, self._start_fields(), self._episode, jnp.zeros(env.action_size))
         self._names = sorted(recorder.names)
         self._recollection = NOTHING
+        self._observation: Any = None  # what the policy saw
         self._split = jax.jit(env.split_rng)
         self._start = jax.jit(env.draw)
         self._observe = jax.jit(self._first_observation)
@@ -82,8 +89,8 @@ class InMujoco:
         _C.mj_forward(model, data)
         self.data = data
         fields = self._fields()
-        observation, self._recollection = self._observe(memory_rng, fields, self._episode)
-        return np.asarray(observation)
+        self._observation, self._recollection = self._observe(memory_rng, fields, self._episode)
+        return np.asarray(self._observation)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
         """Returns the next observation [O], the reward, and whether the episode ended.
@@ -105,25 +112,30 @@ class InMujoco:
         _C.mj_step(self.model, self.data, self.env.frame_skip)
         if self.env.contact_forces:
             _C.mj_rnePostConstraint(self.model, self.data)
-        observation, reward, terminated, self._recollection = self._advance(
-            before, self._fields(), self._episode, self._recollection, np.asarray(action)
+        self._observation, reward, terminated, self._recollection = self._advance(
+            before,
+            self._fields(),
+            self._episode,
+            self._recollection,
+            self._observation,
+            np.asarray(action),
         )
         # The task would pay for where MuJoCo has put the body back.
         if was_reset(self.data):
             reward = np.nan
-        return np.asarray(observation), float(reward), bool(terminated)
+        return np.asarray(self._observation), float(reward), bool(terminated)
 
     def _first_observation(self, memory_rng, fields, episode):
         data = self._view(fields, episode)
         recollection = recollect_start(self.env, memory_rng, data)
-        return self.env.observe(data), recollection
+        return observed(self.env, data), recollection
 
-    def _outcome(self, before, fields, episode, recollection, action):
+    def _outcome(self, before, fields, episode, recollection, last_frames, action):
         data = self._view(fields, episode)
         next_recollection = recollect_step(self.env, recollection, data, action)
         before = self._view(before, episode, recollection)
         reward, terminated, _ = self.env.outcome(before, data, action)
-        return self.env.observe(data), reward, terminated, next_recollection
+        return observed(self.env, data, last_frames), reward, terminated, next_recollection
 
     def _view(
         self,

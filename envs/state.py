@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from mjx_reinforce.engine.base import MjModel
+from mjx_reinforce.engine.checks import check_count
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
 from mjx_reinforce.engine.play.counter import key_of_words
 from mjx_reinforce.envs.outcomes import check_memory
@@ -115,3 +116,21 @@ def recollect_step(
     memory = check_memory(type(env).__name__, "remember", entries, before.memory)
     view.memory = dict(memory)
     return Recollection(memory, jax.random.key_data(key))
+
+
+def observed(env: Any, view: Any, last_frames: jax.Array | None = None) -> jax.Array:
+    """Returns what a policy sees: the last ``env.frames`` observations, the oldest first.
+
+    Args:
+      env: the ``MujocoEnv``.
+      view: the simulation, as the task reads it.
+      last_frames: what the policy saw before this env step, as this returns it. At the start of an
+        episode there is none, and all frames are the first observation.
+    """
+    check_count("frames", env.frames)
+    observation = env.observe(view)
+    if env.frames == 1:
+        return observation
+    if last_frames is None:
+        return jnp.tile(observation, env.frames)
+    return jnp.concatenate([last_frames[observation.shape[0] :], observation])

@@ -18,6 +18,7 @@ from saved_runs import make_run
 import mjx_reinforce
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import COMMANDS
+from mjx_reinforce.envs import parts
 from mjx_reinforce.registry import load_definition
 from mjx_reinforce.training.record import COLUMNS
 
@@ -26,6 +27,7 @@ DOCS = ROOT / "docs"
 PUBLIC = {name: getattr(mjx_reinforce, name) for name in mjx_reinforce.__all__}
 del PUBLIC["__version__"]
 TASKS = {f"envs.{name}": getattr(envs, name) for name in ("names", "make", "register")}
+PARTS = {f"envs.parts.{name}": getattr(parts, name) for name in parts.__all__}
 #: Comment before a block that no test runs, with the reason.
 NOT_RUN = "<!-- not run: "
 
@@ -57,14 +59,15 @@ def test_every_public_name_has_a_page():
     """Once among the pages of the API, and on the page that has them all."""
     pages = "\n".join(path.read_text("utf-8") for path in (DOCS / "api").glob("*.md"))
     shown = re.findall(r"^::: mjx_reinforce\.(.+)$", pages, re.M)
-    assert sorted(shown) == sorted([*PUBLIC, *TASKS])
+    assert sorted(shown) == sorted([*PUBLIC, *TASKS, *PARTS])
     named = set(re.findall(r"`(?:envs\.)?(\w+)[`(]", page("all.md")))
     assert {*PUBLIC, *(name.removeprefix("envs.") for name in TASKS)} <= named
+    assert {*parts.__all__} <= set(re.findall(r"`(\w+)\(", page("own_task.md")))
 
 
 def test_every_public_function_has_types():
     """Each argument is annotated, and so is what is returned."""
-    for name, it in (PUBLIC | TASKS).items():
+    for name, it in (PUBLIC | TASKS | PARTS).items():
         if inspect.isfunction(it):
             signature = inspect.signature(it)
             typed = [each.annotation for each in signature.parameters.values()]

@@ -48,6 +48,5 @@ def linear_velocity(data: Named, body: str) -> jax.Array:
     part = data.body(body)
     root = data.mj_model.body_rootid[part.id]
     # MuJoCo's velocities are those at the center of mass of the whole tree.
-    angular, linear = part.cvel[:3], part.cvel[3:]
     arm = part.xpos - data.subtree_com[root]  # pyright: ignore[reportAttributeAccessIssue]
-    return (linear + jnp.cross(angular, arm)) @ part.xmat
+    return (part.cvel[3:] + jnp.cross(part.cvel[:3], arm)) @ part.xmat

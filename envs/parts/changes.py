@@ -23,9 +23,10 @@ def command(key: jax.Array, low: ArrayLike, high: ArrayLike, rest_share: float =
       high: [n] the most.
       rest_share: the probability that all are 0, so that the robot learns to stand.
     """
-    low, high = jnp.asarray(low, float), jnp.asarray(high, float)
+    low = jnp.asarray(low, float)
     rest_key, key = jax.random.split(key)
-    speeds = low + (high - low) * jax.random.uniform(key, low.shape, low.dtype)
+    shares = jax.random.uniform(key, low.shape, low.dtype)
+    speeds = low + (jnp.asarray(high, float) - low) * shares
     return jnp.where(jax.random.uniform(rest_key) < rest_share, 0.0, speeds)
 
 

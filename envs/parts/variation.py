@@ -115,15 +115,13 @@ def actuators(
       ValueError: an actuator is no motor or servo, such as a muscle.
     """
     biases = np.asarray(model.actuator_biastype)
-    is_servo = biases == _AFFINE_BIAS
-    is_known = (np.asarray(model.actuator_gaintype) == _FIXED_GAIN) & (
-        is_servo | (biases == _NO_BIAS)
-    )
-    others = ", ".join(map(str, np.flatnonzero(~is_known)))
+    is_linear = np.asarray(model.actuator_gaintype) == _FIXED_GAIN
+    is_linear &= np.isin(biases, (_NO_BIAS, _AFFINE_BIAS))
     require(
-        not others,
+        np.all(is_linear),
         "parts.actuators varies motors and servos, with a fixed gain and no bias or an affine one; "
-        f"return actuator_gainprm and actuator_biasprm from randomize yourself for these: {others}",
+        "return actuator_gainprm and actuator_biasprm from randomize yourself, since these "
+        f"actuators are none: {np.flatnonzero(~is_linear)}",
     )
     gain = jnp.asarray(model.actuator_gainprm)
     bias = jnp.asarray(model.actuator_biasprm)
@@ -132,8 +130,9 @@ def actuators(
         _factors(part_key, (model.nu,), *limits)
         for part_key, limits in zip(jax.random.split(key, 3), ranges, strict=True)
     )
-    # The force is gain control + bias0 + bias1 angle + bias2 speed; which of these the control is
-    # to be, the model does not say, but a position servo has a bias of the angle.
+    # ``mj_fwdActuation``: gain * control + bias0 + bias1 * angle + bias2 * speed. What the control
+    # is does not stand in the model, but only a position servo has a bias of the angle.
+    is_servo = biases == _AFFINE_BIAS
     holds_angle = is_servo & (model.actuator_biasprm[:, 1] != 0)
     holds_speed = is_servo & ~holds_angle & (model.actuator_biasprm[:, 2] != 0)
     gain_factor = force * jnp.where(holds_angle, kp, jnp.where(holds_speed, kv, 1.0))

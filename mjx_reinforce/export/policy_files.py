@@ -67,7 +67,8 @@ def save_policy(directory: Path, actor: Actor, settings: dict[str, Any]) -> None
       actor: every leaf with a leading seed axis [S, ...].
       settings: ``policy`` (a name), ``hidden_sizes``, ``initial_std``, ``observation_size``,
         ``action_low`` and ``action_high`` or, if discrete, ``num_actions``; optionally
-        ``initializer`` and ``rescale``: what ``build_policy`` reads.
+        ``initializer`` and ``rescale``: what ``build_policy`` reads; and ``frames``, how many
+        observations of the environment are one of the policy's, as of ``MujocoEnv``.
 
     Examples:
       >>> import pathlib, tempfile

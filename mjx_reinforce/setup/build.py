@@ -120,6 +120,7 @@ def policy_settings(env: Environment, config: Config) -> dict[str, Any]:
         "initial_std": config.initial_std,
         "rescale": True,
         "observation_size": observation_size(env),
+        "frames": getattr(env, "frames", 1),  # of a MujocoEnv, which a robot's program has to keep
         **space_settings,
         **algorithm.policy,
     }

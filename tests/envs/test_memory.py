@@ -374,3 +374,52 @@ def test_attributes_of_a_task_may_have_the_names_of_methods_that_it_lacks():
     state = jax.jit(lambda key: task.step(task.reset(key), jnp.zeros(1)))(jax.random.key(0))
     assert state.reward == 3
     InMujoco(env).reset(jax.random.key(0))
+
+
+class Framed(Counting):
+    """A policy sees three counts, of which the first is 7."""
+
+    frames = 3
+
+    def observe(self, data):
+        return data.memory["array"][:1] + 7
+
+
+#: What it sees at the start and after each step.
+SEEN = [[7, 7, 7], [7, 7, 8], [7, 8, 9], [8, 9, 10], [9, 10, 11]]
+
+
+@pytest.mark.parametrize(
+    "engine", [pytest.param("vmap", marks=pytest.mark.slow), "mujoco", "InMujoco"]
+)
+def test_a_policy_sees_the_last_observations(engine):
+    env = Framed()
+    assert (env.observation_size, env.frames) == (3, 3)
+    if engine == "InMujoco":
+        simulation = InMujoco(env)
+        observations = [simulation.reset(jax.random.key(0))]
+        observations += [simulation.step(np.zeros(1, np.float32))[0] for _ in SEEN[1:]]
+        np.testing.assert_array_equal(observations, SEEN)
+        np.testing.assert_array_equal(simulation.reset(jax.random.key(1)), SEEN[0])
+        return
+    task = env.in_c_mujoco() if engine == "mujoco" else env
+    step = jax.jit(task.step)
+    states = [jax.jit(task.reset)(jax.random.key(0))]
+    for _ in SEEN[1:]:
+        states.append(step(states[-1], jnp.zeros(1)))
+    np.testing.assert_array_equal([state.obs for state in states], SEEN)
+
+
+def test_the_next_episode_of_an_environment_begins_with_frames_of_its_own():
+    vec = make_vec(Framed(), num_envs=2, engine="mujoco", max_episode_steps=len(SEEN) - 1)
+    state = vec.reset(jax.random.key(0))
+    for seen in [*SEEN[1:], *SEEN]:
+        state = vec.step(state, jnp.zeros((2, 1)))
+        np.testing.assert_array_equal(state.obs, [seen, seen])
+
+
+@pytest.mark.parametrize("frames", [0, 1.5])
+def test_frames_that_are_no_count_are_refused(frames):
+    env = type("Wrong", (Framed,), {"frames": frames})()
+    with pytest.raises(ValueError, match="frames must be"):
+        jax.eval_shape(env.reset, jax.random.key(0))

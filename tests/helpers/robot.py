@@ -37,10 +37,11 @@ WEIGHTS = {"track": 1.0, "upright": 0.3, "rate": -0.05, "effort": -0.1, "speed":
 
 
 class Robot(MujocoEnv):
-    """It draws a model, acts and observes late, is pushed, and follows a command."""
+    """It draws a model, acts and observes late, is pushed, follows a command, has two frames."""
 
-    def __init__(self, frames=1, steps=12):
-        self.frames = frames
+    frames = 2
+
+    def __init__(self, steps=12):
         super().__init__(
             xml_file=MjSpec.from_string(ROBOT),
             frame_skip=4,

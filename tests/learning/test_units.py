@@ -108,6 +108,15 @@ def test_the_setting_in_words_and_in_own_families():
     assert np.exp(build_policy(kept).distribution.constants) == pytest.approx(0.5)
 
 
+def test_a_saved_policy_says_how_many_observations_it_sees():
+    """A robot's program has to keep them."""
+    env = Geared(8.0)
+    config = Config(env="Geared-v0")
+    assert build.policy_settings(env, config)["frames"] == 1
+    env.frames = 3
+    assert build.policy_settings(env, config)["frames"] == 3
+
+
 def test_the_noise_of_every_entry_shrinks_to_the_final_one():
     env = Target()
     env.action_space = Box(np.array([-8.0, -1.0]), np.array([8.0, 1.0]))

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from players import actor_and_act, only_active, played
+from robot import Robot
 
 from mjx_reinforce import envs, make_vec
 from mjx_reinforce.engine.gpu import cubin, team_kernel
@@ -126,10 +127,14 @@ def test_teams_play_the_same_episodes(teams, name):
     np.testing.assert_array_equal(got.simulated, got.mask.sum((1, 2)))
 
 
-def as_without_teams(teams, task, steps):
-    """Returns the episodes of a leg that machine code plays on the CPU; teams play the same."""
+def leg(task, steps):
+    """Returns a task on a leg."""
     spec = mujoco.MjSpec.from_string(LEG)
-    env = task(xml_file=spec, frame_skip=2, max_episode_steps=steps, reward_threshold=None)
+    return task(xml_file=spec, frame_skip=2, max_episode_steps=steps, reward_threshold=None)
+
+
+def as_without_teams(teams, env):
+    """Returns the episodes of a task that machine code plays on the CPU; teams play the same."""
     player = actor_and_act(env, (5,))
     want = played(native.native_rollout, env, player, num_seeds=2)
     made = teams()
@@ -143,14 +148,13 @@ def as_without_teams(teams, task, steps):
 
 @pytest.mark.slow
 def test_teams_show_sensors(teams):
-    want = as_without_teams(teams, Leg, 60)
+    want = as_without_teams(teams, leg(Leg, 60))
     assert (want.observation[..., 9] > 0).any()  # touch
 
 
 @pytest.mark.slow
 def test_teams_play_models_that_differ_from_episode_to_episode(teams):
-    spec = mujoco.MjSpec.from_string(LEG)
-    env = RandomLeg(xml_file=spec, frame_skip=2, max_episode_steps=40, reward_threshold=None)
+    env = leg(RandomLeg, 40)
     actor, act, distribution = actor_and_act(env, (5,))
     want = played(native.native_rollout, env, (actor, act, distribution), num_seeds=2)
     made = teams()
@@ -167,12 +171,19 @@ def test_teams_play_models_that_differ_from_episode_to_episode(teams):
 
 @pytest.mark.slow
 def test_teams_play_episodes_that_remember(teams):
-    want = as_without_teams(teams, RememberingLeg, 40)
+    want = as_without_teams(teams, leg(RememberingLeg, 40))
     np.testing.assert_allclose(
         want.observation[:, 1:20, :, -3], want.action[:, :19, :, 0], atol=1e-6
     )
     noise = want.observation[:, :20, :, -1]
     assert len(np.unique(noise)) == noise.size  # of each seed, step and episode
+
+
+@pytest.mark.slow
+def test_teams_play_a_task_of_all_parts(teams):
+    want = as_without_teams(teams, Robot(steps=20))
+    commands = want.observation[:, 0, :, -1]
+    assert len(np.unique(commands[commands != 0])) > 3
 
 
 def test_a_table_with_infinity_is_not_static():
