@@ -9,6 +9,7 @@ import tyro
 from mjx_reinforce.files import check_module, check_output, write_bytes
 from mjx_reinforce.settings.flags import run_command
 
+
 @dataclasses.dataclass(frozen=True)
 class NewSettings:
     """Write the class of an environment for a MuJoCo model, with a reward for you to change."""

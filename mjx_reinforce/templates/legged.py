@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -17,13 +17,32 @@ _PERIOD = 0.02
 _EPISODE = 10.0
 _COMMAND = 5.0
 _PUSH = 4.0
-#: A foot makes a step in so many seconds, and is lifted by this share of the robot's height, up to
-#: so much (m).
+#: A foot makes a step in so many seconds, and is lifted by up to so much (m).
 _GAIT = 0.5
-_LIFT = 0.2
 _HIGHEST_LIFT = 0.08
 #: Below this share of its height, the robot has fallen.
 _LOWEST = 0.6
+#: Robots of this height (m) and higher walk at full speed, lower ones as the root of the height.
+_TALL = 0.3
+
+
+class _Pace(NamedTuple):
+    """How a robot is to walk: the most of each number of a command, of a push, and of a lift.
+
+    forward, sideways, push: (m/s)
+    turn: (rad/s)
+    lift: of the robot's height
+    """
+
+    forward: float
+    sideways: float
+    turn: float
+    push: float
+    lift: float
+
+
+_ON_FOUR = _Pace(forward=1.0, sideways=0.3, turn=0.5, push=0.5, lift=0.2)
+_ON_TWO = _Pace(forward=0.4, sideways=0.1, turn=0.3, push=0.2, lift=0.12)
 _HOME_OF_CONTROLS = """\
         self.home = self.mj_model.key_ctrl[0]
 """
@@ -68,6 +87,7 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
     period = frame_skip * timestep
     pose = "self.mj_model.key_qpos[0]" if model.nkey else "self.mj_model.qpos0"
     height = _height(model)
+    pace = _pace(model)
     home = _HOME_OF_JOINTS.format(pose=pose)
     if model.nkey and model.key_ctrl[0].any():
         home = _HOME_OF_CONTROLS
@@ -91,7 +111,11 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
             command_period=round(_COMMAND / period),
             push_period=round(_PUSH / period),
             gait_period=round(_GAIT / period),
-            lift=round(min(_LIFT * height, _HIGHEST_LIFT), 3),
+            forward=pace.forward,
+            sideways=pace.sideways,
+            turn=pace.turn,
+            push=pace.push,
+            lift=round(min(pace.lift * height, _HIGHEST_LIFT), 3),
             lowest=round(_LOWEST * height, 3),
             nu=model.nu,
             home=home,
@@ -99,6 +123,18 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
             effort_weight='    "effort": -0.1,\n' if limit else "",
             effort_term=_effort(limit),
         )
+    )
+
+
+def _pace(model: "MjModel") -> _Pace:
+    """Returns the pace of a robot of this height and number of feet."""
+    from mjx_reinforce.envs.parts import feet
+
+    pace = _ON_TWO if len(feet(model)) == 2 else _ON_FOUR
+    # Animals of all sizes walk alike at equal Froude numbers, speed^2 / (gravity height).
+    share = min(1.0, (_height(model) / _TALL) ** 0.5)
+    return pace._replace(
+        forward=round(share * pace.forward, 1), sideways=round(share * pace.sideways, 1)
     )
 
 
