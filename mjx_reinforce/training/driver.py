@@ -450,13 +450,15 @@ def env_steps_in(
     start_time = time.perf_counter()
     moments = [_Moment.of(0.0, slots)]
     # Calls of 1, 2, 4, ... updates: nobody knows yet how long one takes, and so the last call is
-    # about half of the trial.
-    while moments[-1].seconds < _TRIAL_SHARE * seconds and not (moments[1:] and interrupted()):
+    # about half of the trial. The first call does not count as a trial: on a GPU it loads programs.
+    trial = 0.0
+    while trial < _TRIAL_SHARE * seconds and not (moments[1:] and interrupted()):
         num_updates = 2 ** (len(moments) - 1)
         slots.budget = Budget.of(None, min(moments[-1].updates + num_updates, max_updates))
         if not slots.advance(evaluate=False):
             break  # no seed has an update left
         moments.append(_Moment.of(time.perf_counter() - start_time, slots))
+        trial = moments[-1].seconds - moments[1].seconds
     start = moments[0]
     end = moments[-1]
     if len(moments) == 1:
@@ -467,9 +469,10 @@ def env_steps_in(
     # The trial was not evaluated. The run is, after every block, and stands still meanwhile unless
     # evaluations share the launches of updates.
     block_seconds = config.block_length * elapsed / (end.updates - middle.updates)
+    slots.seconds_to_evaluate()  # the first has what a device does once
     eval_seconds = slots.seconds_to_evaluate()
     env_steps_per_second = (end.env_steps - middle.env_steps) / elapsed
     env_steps_per_second = env_steps_per_second * block_seconds / (block_seconds + eval_seconds)
     # The trial took its time, and what it trained is undone: the run goes on from its start.
-    remaining_seconds = max(seconds - end.seconds - eval_seconds, 0.0)
+    remaining_seconds = max(seconds - (time.perf_counter() - start_time), 0.0)
     return min(max(1, round(start.env_steps + env_steps_per_second * remaining_seconds)), MAX_COUNT)

@@ -101,10 +101,14 @@ def test_a_budget_chooses_the_settings():
 
 
 class Machine:
-    """Slots whose runs play so many env steps in each update, which takes a second."""
+    """Slots whose runs play so many env steps in each update, which takes a second.
 
-    def __init__(self, played, evaluating=0.0):
+    What is done once takes its time before the first update, and before the first evaluation.
+    """
+
+    def __init__(self, played, evaluating=0.0, once=0.0):
         self.played, self.evaluating, self.now = iter(played), evaluating, 0.0
+        self.once = {"advance": once, "evaluate": once}
         self.env_steps, self.updates, self.budget = 0, 0, None
 
     def states(self):
@@ -116,11 +120,13 @@ class Machine:
         assert not evaluate
         made = int(counts.to_int(np.asarray(self.budget.updates))) - self.updates
         self.env_steps += sum(itertools.islice(self.played, made))
-        self.updates, self.now = self.updates + made, self.now + made
+        self.updates, self.now = self.updates + made, self.now + made + self.once.pop("advance", 0)
         return [None] * made
 
     def seconds_to_evaluate(self):
-        return self.evaluating
+        elapsed = self.evaluating + self.once.pop("evaluate", 0)
+        self.now += elapsed
+        return elapsed
 
 
 @pytest.mark.parametrize(
@@ -130,7 +136,9 @@ class Machine:
         (300.0, Machine(itertools.repeat(50)), Config(), 50 * (300 - 15)),
         (300.0, Machine([*[1000] * 7, *[10] * 8]), Config(), 10 * 285),  # its second half counts
         # Blocks of 10 updates wait 10 s for an evaluation: the speed is half.
-        (310.0, Machine(itertools.repeat(50), 10.0), Config(eval_every=10), 25 * (310 - 15 - 10)),
+        (310.0, Machine(itertools.repeat(50), 10.0), Config(eval_every=10), 25 * (310 - 15 - 20)),
+        # What is done once, more than the trial's share, says nothing about the speed.
+        (300.0, Machine(itertools.repeat(50), once=60.0), Config(), 50 * (300 - 15 - 120)),
         (1e6, Machine(itertools.repeat(7)), Config(max_updates=3), 7 * (10**6 - 3)),  # it ends
         (1e12, Machine(itertools.repeat(10**9)), Config(max_updates=4), MAX_COUNT),
     ],

@@ -1,0 +1,92 @@
+"""How well policies of a robot on legs follow their commands, in C MuJoCo.
+
+    python -m experiments.checks.tracking go1_run
+
+The task is one that ``python -m mjx_reinforce.new`` wrote, in the folder at hand. Each episode has
+one command, with the task's noise, delay, and pushes. A row is the mean absolute error of a seed's
+last policy over all but the first seconds of 100 episodes of 10 s. From a fall on, the error is the
+whole command.
+"""
+
+import dataclasses
+import importlib
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from mjx_reinforce import load, make_vec
+from mjx_reinforce.export.run_files import read_run
+
+#: The terms of the reward that are errors, and their units.
+ERRORS = {"forward_error": "m/s", "sideways_error": "m/s", "turn_error": "rad/s"}
+#: More env steps than an episode has: its first command stays.
+_NEVER = 10**6
+
+
+@dataclasses.dataclass(frozen=True)
+class TrackingSettings:
+    """Measure how well the policies of a run follow their commands."""
+
+    run: tyro.conf.Positional[Path]
+    """The run directory."""
+    episodes: int = 100
+    """How many episodes each policy plays."""
+    ignored_seconds: float = 2.0
+    """The start of an episode that does not count."""
+    engine: str = "mujoco"
+    """What plays them."""
+
+
+def tracking_errors(settings: TrackingSettings, task: Any, seed: int) -> tuple[np.ndarray, float]:
+    """Returns the mean absolute errors [3] of a seed's policy, and the share that did not fall."""
+    env = _with_one_command(task)()
+    vec = make_vec(env, settings.episodes, engine=settings.engine, autoreset="disabled")
+    weights = sys.modules[task.__module__].WEIGHTS
+    policy = load(settings.run, seed)
+    step = jax.jit(vec.step)
+    state = jax.jit(vec.reset)(jax.random.key(7))
+    commands = np.abs(state.simulation.pipeline_state.memory["command"])
+    stands = np.ones(settings.episodes, bool)
+    errors = []
+    for _ in range(env.max_episode_steps):
+        actions = policy.act(np.asarray(state.obs))
+        state = step(state, jnp.asarray(actions, jnp.float32))
+        terms = [np.asarray(state.metrics[f"reward_{name}"]) / weights[name] for name in ERRORS]
+        stands &= ~np.asarray(state.terminated)
+        errors.append(np.where(stands[:, None], np.stack(terms, axis=1), commands))
+    counted = errors[round(settings.ignored_seconds / env.dt) :]
+    return np.mean(counted, axis=(0, 1)), float(stands.mean())
+
+
+def _with_one_command(task: Any) -> Any:
+    """Returns the class of a task, whose module now gives each episode one command."""
+    module: Any = sys.modules[task.__module__]
+    module.COMMAND_PERIOD = _NEVER
+    module.REST_SHARE = 0.0
+    return task
+
+
+def main() -> None:
+    """Prints a row for each seed of a run."""
+    settings = tyro.cli(TrackingSettings, description=__doc__)
+    sys.path.insert(0, "")
+    config = read_run(settings.run).config
+    module, _, name = config.env.partition(":")
+    task = getattr(importlib.import_module(module), name)
+    seeds = range(config.num_seeds)
+    if config.seeds:
+        seeds = range(*map(int, config.seeds.split(":")))
+    print("| seed | " + " | ".join(f"{name} ({unit})" for name, unit in ERRORS.items()), end="")
+    print(" | did not fall |\n|---|---|---|---|---|")
+    for seed in seeds:
+        errors, standing = tracking_errors(settings, task, seed)
+        print(f"| {seed} | " + " | ".join(f"{x:.3f}" for x in errors), f"| {standing:.0%} |")
+
+
+if __name__ == "__main__":
+    main()

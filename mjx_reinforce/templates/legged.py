@@ -1,0 +1,172 @@
+"""The class of a robot on legs, which walks as it is commanded."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from mjx_reinforce.templates import facts
+
+if TYPE_CHECKING:
+    from mjx_reinforce.engine.base import MjModel
+
+#: Actions (s), episodes, commands, and pushes (s) of the class.
+_PERIOD = 0.02
+_EPISODE = 10.0
+_COMMAND = 5.0
+_PUSH = 4.0
+#: A foot makes a step in so many seconds, and is lifted by up to so much (m).
+_GAIT = 0.5
+_HIGHEST_LIFT = 0.08
+#: Below this share of its height, the robot has fallen.
+_LOWEST = 0.6
+#: Robots of this height (m) and higher walk at full speed, lower ones as the root of the height.
+_TALL = 0.3
+
+
+class _Pace(NamedTuple):
+    """How a robot is to walk: the most of each number of a command, of a push, and of a lift.
+
+    forward, sideways, push: (m/s)
+    turn: (rad/s)
+    lift: of the robot's height
+    """
+
+    forward: float
+    sideways: float
+    turn: float
+    push: float
+    lift: float
+
+
+_ON_FOUR = _Pace(forward=1.0, sideways=0.3, turn=0.5, push=0.5, lift=0.2)
+_ON_TWO = _Pace(forward=0.4, sideways=0.1, turn=0.3, push=0.2, lift=0.12)
+_HOME_OF_CONTROLS = """\
+        self.home = self.mj_model.key_ctrl[0]
+"""
+_HOME_OF_JOINTS = """\
+        joints = self.mj_model.actuator_trnid[:, 0]
+        self.home = {pose}[self.mj_model.jnt_qposadr[joints]]
+"""
+_LIMIT = """\
+        self.limit = {limit}  # the most that a servo does (N m)
+"""
+_START = """\
+        joints = self.mj_model.jnt_qposadr[self.mj_model.actuator_trnid[:, 0]]
+        noise = jax.random.uniform(rng, ({nu},), minval=-0.1, maxval=0.1)
+        qpos = jnp.asarray({pose}).at[joints].add(noise)
+        return {{"qpos": qpos, "ctrl": jnp.asarray(self.home)}}"""
+
+
+def is_legged(model: "MjModel") -> bool:
+    """Returns whether a model is a robot that stands on its feet, with servos in all joints.
+
+    Its body, which is to be upright, and the joints of its servos have names.
+    """
+    from mjx_reinforce.envs.parts import feet
+
+    is_free = bool(model.njnt > 0 and model.jnt_type[0] == 0)
+    if not is_free or not facts.has_servos(model) or len(feet(model)) < 2:
+        return False
+    names = [_body(model), *_joints(model)]
+    return all(names) and np.allclose(facts.direction_up(model), [0, 0, 1], atol=0.1)
+
+
+def class_source(model: "MjModel", xml: str, module: str) -> str:
+    """Returns the text of the class, as ``model_class.class_source``.
+
+    Args:
+      model: one that ``is_legged``.
+      xml: the name of its file, in the folder of the class.
+      module: the name of the class's file, without its ending.
+    """
+    timestep = float(model.opt.timestep)
+    frame_skip = max(1, round(_PERIOD / timestep))
+    period = frame_skip * timestep
+    pose = "self.mj_model.key_qpos[0]" if model.nkey else "self.mj_model.qpos0"
+    height = _height(model)
+    pace = _pace(model)
+    home = _HOME_OF_JOINTS.format(pose=pose)
+    if model.nkey and model.key_ctrl[0].any():
+        home = _HOME_OF_CONTROLS
+    limit = _limit(model)
+    if limit is not None:
+        home += _LIMIT.format(limit=limit)
+    return (
+        Path(__file__)
+        .with_name("legged.txt")
+        .read_text("utf-8")
+        .format(
+            title=facts.class_name(module),
+            module=module,
+            xml=json.dumps(xml),
+            body=json.dumps(_body(model)),
+            joints="\n".join(f"    {json.dumps(name)}," for name in _joints(model)),
+            frame_skip=frame_skip,
+            timestep=timestep,
+            period=period,
+            steps=round(_EPISODE / period),
+            command_period=round(_COMMAND / period),
+            push_period=round(_PUSH / period),
+            gait_period=round(_GAIT / period),
+            forward=pace.forward,
+            sideways=pace.sideways,
+            turn=pace.turn,
+            push=pace.push,
+            lift=round(min(pace.lift * height, _HIGHEST_LIFT), 3),
+            lowest=round(_LOWEST * height, 3),
+            nu=model.nu,
+            home=home,
+            start=_START.format(nu=model.nu, pose=pose),
+            effort_weight='    "effort": -0.1,\n' if limit else "",
+            effort_term=_effort(limit),
+        )
+    )
+
+
+def _pace(model: "MjModel") -> _Pace:
+    """Returns the pace of a robot of this height and number of feet."""
+    from mjx_reinforce.envs.parts import feet
+
+    pace = _ON_TWO if len(feet(model)) == 2 else _ON_FOUR
+    # Animals of all sizes walk alike at equal Froude numbers, speed^2 / (gravity height).
+    share = min(1.0, (_height(model) / _TALL) ** 0.5)
+    return pace._replace(
+        forward=round(share * pace.forward, 1), sideways=round(share * pace.sideways, 1)
+    )
+
+
+def _effort(limit: str | None) -> str:
+    """Returns the line of the term of the servos' forces, where they have limits."""
+    if limit is None:
+        return ""
+    return '            "effort": parts.effort(data.actuator_force, self.limit),\n'
+
+
+def _body(model: "MjModel") -> str:
+    """Returns the name of the body that the free joint moves."""
+    return model.body(int(model.jnt_bodyid[0])).name
+
+
+def _joints(model: "MjModel") -> Iterator[str]:
+    """Yields the names of the servos' joints."""
+    for joint in model.actuator_trnid[:, 0]:
+        yield model.joint(int(joint)).name
+
+
+def _height(model: "MjModel") -> float:
+    """Returns the height of the body over the floor in the first pose (m)."""
+    pose: Any = model.key_qpos[0] if model.nkey else model.qpos0
+    return float(pose[2])
+
+
+def _limit(model: "MjModel") -> str | None:
+    """Returns what the limits of the servos' forces are, of actuators or of joints; or None."""
+    joints = model.actuator_trnid[:, 0]
+    if model.actuator_forcelimited.all():
+        return "self.mj_model.actuator_forcerange[:, 1]"
+    if model.jnt_actfrclimited[joints].all():
+        return "self.mj_model.jnt_actfrcrange[self.mj_model.actuator_trnid[:, 0], 1]"
+    return None

@@ -1,0 +1,116 @@
+"""Gaits: the feet of a model, what lifts them, and in which turn."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from places import ROOT
+
+from mjx_reinforce.envs import parts
+
+QUADRUPED = ROOT / "experiments" / "examples" / "quadruped.xml"
+PERIOD = 20
+HEIGHT = 0.05
+
+
+@pytest.fixture(scope="module")
+def quadruped():
+    return mujoco.MjModel.from_xml_path(str(QUADRUPED))
+
+
+def robot(num_legs):
+    """Returns a body on legs in a circle, each of which swings, folds and turns out."""
+    legs = "".join(
+        f"""
+        <body euler="0 0 {360 * leg / num_legs + 10}"><body pos="0.3 0 0">
+          <joint name="out{leg}" axis="1 0 0"/><geom size="0.03" contype="0" conaffinity="0"/>
+          <body euler="0 30 0"><joint name="swing{leg}" axis="0 1 0"/>
+            <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02" contype="0" conaffinity="0"/>
+            <body pos="0 0 -0.2" euler="0 -60 0"><joint name="knee{leg}" axis="0 1 0"/>
+              <geom name="shin{leg}" size="0.02" pos="0 0 -0.1"/>
+              <geom name="foot{leg}" size="0.02" pos="0 0 -0.2"/>
+        </body></body></body></body>"""
+        for leg in range(num_legs)
+    )
+    servos = "".join(
+        f'<position joint="{name}{leg}"/>'
+        for name in ("knee", "out", "swing")
+        for leg in range(num_legs)
+    )
+    return mujoco.MjModel.from_xml_string(
+        f"""<mujoco><worldbody><geom type="plane" size="0 0 1"/><body name="trunk" pos="0 0 0.37">
+        <freejoint/><geom size="0.05" mass="5"/>{legs}</body></worldbody>
+        <actuator>{servos}</actuator></mujoco>"""
+    )
+
+
+def foot_positions(model, geoms, controls):
+    """Returns where geoms are [N, 3] when the servos' joints are where the controls say."""
+    data = mujoco.MjData(model)
+    addresses = model.jnt_qposadr[model.actuator_trnid[:, 0]]
+    data.qpos[addresses] += controls
+    mujoco.mj_kinematics(model, data)
+    return data.geom_xpos[geoms]
+
+
+@pytest.mark.parametrize("num_legs", [2, 4, 6])
+def test_feet_are_lifted_straight_up_and_neighbors_in_turn(num_legs):
+    model = robot(num_legs)
+    feet = parts.feet(model)
+    names = {model.geom(foot.geom).name for foot in feet}
+    assert names == {f"foot{leg}" for leg in range(num_legs)}
+    geoms = [foot.geom for foot in feet]
+    gait = parts.gait(model, HEIGHT, PERIOD)
+    assert gait.shape == (PERIOD, model.nu)
+    resting = foot_positions(model, geoms, np.zeros(model.nu))
+    for step in range(PERIOD):
+        moved = foot_positions(model, geoms, gait[step]) - resting
+        heights = HEIGHT * np.sin(2 * np.pi * (step / PERIOD + np.arange(num_legs) / 2))
+        # Half way up, a foot leaves the line by a little: the joints go in proportion.
+        np.testing.assert_allclose(moved[:, 2], np.maximum(heights, 0), atol=0.1 * HEIGHT)
+        np.testing.assert_allclose(moved[:, :2], 0, atol=0.15 * HEIGHT)
+    highest = foot_positions(model, geoms, gait[PERIOD // 4]) - resting
+    np.testing.assert_allclose(highest[::2], np.tile([0, 0, HEIGHT], (num_legs // 2, 1)), atol=1e-4)
+    np.testing.assert_allclose(highest[1::2], 0, atol=1e-9)
+
+
+def test_a_quadruped_trots(quadruped):
+    feet = parts.feet(quadruped)
+    sides = [tuple(np.sign(foot.position[:2])) for foot in feet]
+    assert sides[::2] in ([(-1, -1), (1, 1)], [(1, -1), (-1, 1)])
+    assert all(len(foot.joints) == 3 for foot in feet)
+
+
+def test_a_foot_that_only_a_pair_lets_touch_is_one(quadruped):
+    spec = mujoco.MjSpec.from_file(str(QUADRUPED))
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = 0
+    spec.geoms[0].name = "floor"
+    for number, geom in enumerate(spec.geoms[1:]):
+        geom.name = f"part{number}"
+        if geom.type == mujoco.mjtGeom.mjGEOM_BOX and geom.parent.name != "torso":
+            spec.add_pair(geomname1="floor", geomname2=geom.name)
+    found = [foot.position for foot in parts.feet(spec.compile())]
+    np.testing.assert_allclose(found, [foot.position for foot in parts.feet(quadruped)])
+
+
+def test_a_model_without_feet_has_no_gait():
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><freejoint/><geom size="1"/></body></worldbody></mujoco>'
+    )
+    assert parts.feet(model) == []
+    with pytest.raises(ValueError, match=re.escape("two feet or more, and this model has 0")):
+        parts.gait(model, HEIGHT, PERIOD)
+
+
+def test_tables_and_clocks_repeat():
+    table = np.arange(12.0).reshape(4, 3)
+    steps = jnp.arange(9)
+    rows = jax.vmap(lambda step: parts.cyclic(table, step))(steps)
+    np.testing.assert_array_equal(rows, table[np.arange(9) % 4])
+    clocks = jax.vmap(lambda step: parts.clock(step, 4))(steps)
+    quarters = np.array([[0, 1], [1, 0], [0, -1], [-1, 0]])
+    np.testing.assert_allclose(clocks, quarters[np.arange(9) % 4], atol=1e-6)
