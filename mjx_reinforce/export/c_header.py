@@ -9,6 +9,39 @@ import numpy as np
 from mjx_reinforce.export.arithmetic import Arithmetic
 from mjx_reinforce.learning import normalize
 
+#: What a header has where the policy sees several observations.
+_FRAMES = """\
+#define {NAME}_FRAMES {frames}
+
+// The last observations of one robot, the oldest first. It is the caller's: threads may act side by
+// side, each with a state of its own.
+struct {name}_state {{
+    float frames[{NAME}_FRAMES * {NAME}_OBSERVATION_SIZE];
+    int length;
+}};
+
+// Forgets them: the next observation is the first of an episode.
+static inline void {name}_reset(struct {name}_state *state) {{
+    state->length = 0;
+}}
+"""
+_REMEMBER = """\
+    // The first observation is all of them; then each takes the place of the oldest.
+    int kept = state->length - {NAME}_OBSERVATION_SIZE;
+    for (int i = 0; i < {NAME}_FRAMES * {NAME}_OBSERVATION_SIZE; i++)
+        state->frames[i] = i < kept ? state->frames[i + {NAME}_OBSERVATION_SIZE]
+                                    : observation[i % {NAME}_OBSERVATION_SIZE];
+    state->length = {NAME}_FRAMES * {NAME}_OBSERVATION_SIZE;
+"""
+#: What a header has where the control of the task is known.
+_CONTROL = """
+// What the task applies of an action, clipped to the ranges of the actuators.
+static inline void {name}_control(const float *action, float *ctrl) {{
+    for (int i = 0; i < {NAME}_ACTION_SIZE; i++)
+        ctrl[i] = {name}_clip({name}_home[i] + {name}_scale[i] * action[i],
+                              {name}_ctrl_low[i], {name}_ctrl_high[i]);
+}}
+"""
 #: Bytes of a float.
 _FLOAT = np.dtype(np.float32).itemsize
 
@@ -28,13 +61,20 @@ def c_header(arithmetic: Arithmetic, name: str, run: str, env: str, seed: int) -
     # A row is the bias of a unit and its weights, in the order in which the function reads them.
     units = [np.concatenate([bias[:, None], weight.T], axis=1).ravel() for weight, bias in layers]
     arrays = arithmetic.scale | {"network": np.concatenate(units)} | arithmetic.bounds
-    scaled = "observation[i]"
+    arrays |= arithmetic.control
+    scaled = "observation[i]" if arithmetic.frames == 1 else "state->frames[i]"
     if arithmetic.scale:
-        deviations = f"(observation[i] - {name}_mean[i]) / {name}_std[i]"
+        deviations = f"({scaled} - {name}_mean[i]) / {name}_std[i]"
         scaled = f"{name}_clip({deviations}, -{normalize.CLIP}f, {normalize.CLIP}f)"
     parts = _bounded(name, arithmetic.head)
     if arithmetic.head == "argmax":
         parts = _discrete(name)
+    size = f"{name.upper()}_OBSERVATION_SIZE"
+    parts |= {"frames": "", "remember": "", "memory": "state", "count": size, "control": ""}
+    if arithmetic.frames > 1:
+        parts |= _remembering(name, arithmetic.frames, parts)
+    if arithmetic.control:
+        parts["control"] = _CONTROL.format(name=name, NAME=name.upper())
     template = Path(__file__).with_name("c_header.txt").read_text("utf-8")
     return string.Template(template).substitute(
         parts,
@@ -43,7 +83,7 @@ def c_header(arithmetic: Arithmetic, name: str, run: str, env: str, seed: int) -
         run=ascii(run),
         env=ascii(env),
         seed=seed,
-        inputs=sizes[0],
+        inputs=sizes[0] // arithmetic.frames,
         outputs=sizes[-1],
         sizes=", ".join(map(str, sizes)),
         layers=len(layers),
@@ -89,6 +129,21 @@ def _discrete(name: str) -> dict[str, str]:
         if (x[i] > x[greatest])
             greatest = i;
     return greatest;""",
+    }
+
+
+def _remembering(name: str, frames: int, parts: dict[str, str]) -> dict[str, str]:
+    """Returns the parts of the text that differ where the policy sees several observations."""
+    size = f"{name.upper()}_OBSERVATION_SIZE"
+    declared, _, call = parts["use"].rpartition(f"{name}_act(")
+    return {
+        "memory": "state of its own",
+        "count": f"{name.upper()}_FRAMES * {size}",
+        "use": f"struct {name}_state state; {name}_reset(&state);  // at an episode's start\n"
+        f"//     {declared}{name}_act(&state, {call}",
+        "arguments": f"struct {name}_state *state, {parts['arguments']}",
+        "frames": _FRAMES.format(name=name, NAME=name.upper(), frames=frames),
+        "remember": _REMEMBER.format(NAME=name.upper()),
     }
 
 

@@ -15,6 +15,36 @@ _ENDINGS = {
 }
 
 
+#: What a module has where the policy sees several observations.
+_POLICY = """
+
+class Policy:
+    \"""Acts, and remembers the last observations of one robot.\"""
+
+    def __init__(self):
+        self.reset()
+
+    def reset(self):
+        \"""Forgets them: the next observation is the first of an episode.\"""
+        self.frames = None
+
+    def act(self, observation):
+        \"""Returns the action for an observation [{size}].\"""
+        newest = np.array(observation)
+        if self.frames is None:
+            self.frames = [newest] * {frames}
+        self.frames = [*self.frames[1:], newest]
+        return act(np.concatenate(self.frames))
+"""
+#: What a module has where the control of the task is known.
+_CONTROL = """
+
+def control(action):
+    \"""Returns what the task applies of an action, clipped to the ranges of the actuators.\"""
+    return np.clip(P["home"] + P["scale"] * action, P["ctrl_low"], P["ctrl_high"])
+"""
+
+
 def numpy_policy(arithmetic: Arithmetic, name: str, env: str, seed: int) -> tuple[Arrays, str]:
     """Returns the arrays, and the text of the module.
 
@@ -24,7 +54,7 @@ def numpy_policy(arithmetic: Arithmetic, name: str, env: str, seed: int) -> tupl
       env: the id of the environment.
       seed: the number of the seed.
     """
-    arrays = arithmetic.scale | arithmetic.bounds
+    arrays = arithmetic.scale | arithmetic.bounds | arithmetic.control
     lines = []
     if arithmetic.scale:
         scaled = '(x - P["mean"]) / P["std"]'
@@ -38,15 +68,28 @@ def numpy_policy(arithmetic: Arithmetic, name: str, env: str, seed: int) -> tupl
             layer = f"np.tanh({layer})"
         lines.append(f"x = {layer}")
     lines.append(f"return {_ENDINGS[arithmetic.head]}")
-    inputs = len(layers[0][0])
+    inputs = len(layers[0][0]) // arithmetic.frames
     outputs = len(layers[-1][1])
-    shapes = f"[{inputs}] -> an integer, or [N, {inputs}] -> [N]"
+    results = ("an integer", "[N]")
     if arithmetic.head != "argmax":
-        shapes = (
-            f"[{inputs}] -> [{outputs}], or [N, {inputs}] -> [N, {outputs}]"
-            "\n\nActions are clipped to the range that the environment declared."
-        )
+        results = (f"[{outputs}]", f"[N, {outputs}]")
+    shapes = f"[{inputs}] -> {results[0]}"
+    if arithmetic.frames == 1:
+        shapes += f", or [N, {inputs}] -> {results[1]}"
+    if arithmetic.head != "argmax":
+        shapes += "\n\nActions are clipped to the range that the environment declared."
+    placeholders = {"use": "", "acting": name, "further": ""}
+    if arithmetic.frames > 1:
+        placeholders = {
+            "use": f"policy = {name}.Policy()  # one an episode\n    ",
+            "acting": "policy",
+            "further": _POLICY.format(size=inputs, frames=arithmetic.frames),
+        }
+    if arithmetic.control:
+        placeholders["further"] += _CONTROL
     template = Path(__file__).with_name("numpy_policy.txt").read_text("utf-8")
     body = "\n    ".join(lines)
-    source = template.format(name=name, shapes=shapes, env=ascii(env), seed=seed, body=body)
+    source = template.format(
+        name=name, shapes=shapes, env=ascii(env), seed=seed, body=body, **placeholders
+    )
     return arrays, source
