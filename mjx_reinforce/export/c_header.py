@@ -3,45 +3,13 @@
 import string
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mjx_reinforce.export.arithmetic import Arithmetic
 from mjx_reinforce.learning import normalize
 
-#: What a header has where the policy sees several observations.
-_FRAMES = """\
-#define {NAME}_FRAMES {frames}
-
-// The last observations of one robot, the oldest first. It is the caller's: threads may act side by
-// side, each with a state of its own.
-struct {name}_state {{
-    float frames[{NAME}_FRAMES * {NAME}_OBSERVATION_SIZE];
-    int length;
-}};
-
-// Forgets them: the next observation is the first of an episode.
-static inline void {name}_reset(struct {name}_state *state) {{
-    state->length = 0;
-}}
-"""
-_REMEMBER = """\
-    // The first observation is all of them; then each takes the place of the oldest.
-    int kept = state->length - {NAME}_OBSERVATION_SIZE;
-    for (int i = 0; i < {NAME}_FRAMES * {NAME}_OBSERVATION_SIZE; i++)
-        state->frames[i] = i < kept ? state->frames[i + {NAME}_OBSERVATION_SIZE]
-                                    : observation[i % {NAME}_OBSERVATION_SIZE];
-    state->length = {NAME}_FRAMES * {NAME}_OBSERVATION_SIZE;
-"""
-#: What a header has where the control of the task is known.
-_CONTROL = """
-// What the task applies of an action, clipped to the ranges of the actuators.
-static inline void {name}_control(const float *action, float *ctrl) {{
-    for (int i = 0; i < {NAME}_ACTION_SIZE; i++)
-        ctrl[i] = {name}_clip({name}_home[i] + {name}_scale[i] * action[i],
-                              {name}_ctrl_low[i], {name}_ctrl_high[i]);
-}}
-"""
 #: Bytes of a float.
 _FLOAT = np.dtype(np.float32).itemsize
 
@@ -74,12 +42,11 @@ def c_header(arithmetic: Arithmetic, name: str, run: str, env: str, seed: int) -
     if arithmetic.frames > 1:
         parts |= _remembering(name, arithmetic.frames, parts)
     if arithmetic.control:
-        parts["control"] = _CONTROL.format(name=name, NAME=name.upper())
-    template = Path(__file__).with_name("c_header.txt").read_text("utf-8")
-    return string.Template(template).substitute(
-        parts,
-        name=name,
-        NAME=name.upper(),
+        parts["control"] = _filled("c_header_control.txt", name)
+    return _filled(
+        "c_header.txt",
+        name,
+        **parts,
         run=ascii(run),
         env=ascii(env),
         seed=seed,
@@ -93,6 +60,12 @@ def c_header(arithmetic: Arithmetic, name: str, run: str, env: str, seed: int) -
         arrays="\n".join(declaration(f"{name}_{key}", array) for key, array in arrays.items()),
         scaled=scaled,
     )
+
+
+def _filled(file: str, name: str, **placeholders: Any) -> str:
+    """Returns the text of a template with its placeholders filled in."""
+    template = string.Template(Path(__file__).with_name(file).read_text("utf-8"))
+    return template.substitute(placeholders, name=name, NAME=name.upper())
 
 
 def _bounded(name: str, head: str) -> dict[str, str]:
@@ -142,8 +115,8 @@ def _remembering(name: str, frames: int, parts: dict[str, str]) -> dict[str, str
         "use": f"struct {name}_state state; {name}_reset(&state);  // at an episode's start\n"
         f"//     {declared}{name}_act(&state, {call}",
         "arguments": f"struct {name}_state *state, {parts['arguments']}",
-        "frames": _FRAMES.format(name=name, NAME=name.upper(), frames=frames),
-        "remember": _REMEMBER.format(NAME=name.upper()),
+        "frames": _filled("c_header_frames.txt", name, number=frames),
+        "remember": f"    {name}_remember(state, observation);\n",
     }
 
 

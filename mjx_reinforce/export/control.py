@@ -15,7 +15,7 @@ _TOLERANCE = 1e-7
 
 
 def affine_control(env: Environment) -> Arrays:
-    """Returns the numbers of a task's ``control``: home + scale * action, clipped to ``ctrlrange``.
+    """Returns the numbers of a task's ``control``: home + scale * action, in the actuators' ranges.
 
     Args:
       env: a ``MujocoEnv``, or a wrapper of one.

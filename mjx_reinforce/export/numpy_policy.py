@@ -15,36 +15,6 @@ _ENDINGS = {
 }
 
 
-#: What a module has where the policy sees several observations.
-_POLICY = """
-
-class Policy:
-    \"""Acts, and remembers the last observations of one robot.\"""
-
-    def __init__(self):
-        self.reset()
-
-    def reset(self):
-        \"""Forgets them: the next observation is the first of an episode.\"""
-        self.frames = None
-
-    def act(self, observation):
-        \"""Returns the action for an observation [{size}].\"""
-        newest = np.array(observation)
-        if self.frames is None:
-            self.frames = [newest] * {frames}
-        self.frames = [*self.frames[1:], newest]
-        return act(np.concatenate(self.frames))
-"""
-#: What a module has where the control of the task is known.
-_CONTROL = """
-
-def control(action):
-    \"""Returns what the task applies of an action, clipped to the ranges of the actuators.\"""
-    return np.clip(P["home"] + P["scale"] * action, P["ctrl_low"], P["ctrl_high"])
-"""
-
-
 def numpy_policy(arithmetic: Arithmetic, name: str, env: str, seed: int) -> tuple[Arrays, str]:
     """Returns the arrays, and the text of the module.
 
@@ -83,13 +53,18 @@ def numpy_policy(arithmetic: Arithmetic, name: str, env: str, seed: int) -> tupl
         placeholders = {
             "use": f"policy = {name}.Policy()  # one an episode\n    ",
             "acting": "policy",
-            "further": _POLICY.format(size=inputs, frames=arithmetic.frames),
+            "further": _text("frames").format(size=inputs, number=arithmetic.frames),
         }
     if arithmetic.control:
-        placeholders["further"] += _CONTROL
+        placeholders["further"] += _text("control")
     template = Path(__file__).with_name("numpy_policy.txt").read_text("utf-8")
     body = "\n    ".join(lines)
     source = template.format(
         name=name, shapes=shapes, env=ascii(env), seed=seed, body=body, **placeholders
     )
     return arrays, source
+
+
+def _text(part: str) -> str:
+    """Returns what a module has more, where the policy sees several frames, or has a control."""
+    return Path(__file__).with_name(f"numpy_policy_{part}.txt").read_text("utf-8")
