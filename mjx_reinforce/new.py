@@ -101,8 +101,7 @@ def write_class(settings: NewSettings) -> None:
     module = output.stem
     train = f"python -m mjx_reinforce.train --env {module}:{_title(module)} --output {module}_run"
     print(contact_counts(model))
-    if in_c is not None:
-        print(f"C MuJoCo will play it: {in_c}")
+    print("machine code will play it" if in_c is None else f"C MuJoCo will play it: {in_c}")
     if (warning := instability(model)) is not None:
         print(warning)
     if not settings.fix:

@@ -202,6 +202,7 @@ def test_fix_writes_a_mended_copy_and_its_class(tmp_path, monkeypatch, capsys):
     assert changes.partition("\n")[2] in offer
     assert "unstable" in offer
     assert "unstable" not in rest
+    assert "machine code will play it\n" in rest
     assert "servo_fixed:ServoFixed" in rest
     assert (tmp_path / "servo.xml").read_text() == text
     monkeypatch.syspath_prepend(tmp_path)
