@@ -1,8 +1,9 @@
 """Whether a model explodes in C MuJoCo itself, which no learning rate mends."""
 
+import copy
 import time
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -16,8 +17,23 @@ _C: Any = mujoco
 _SECONDS = 1.0
 #: How long that may take on the clock (s); a large model is tried for less.
 _WAIT = 0.04
+#: The same of a remedy, which has to last for all of the second.
+_TRIAL_WAIT = 2.0
+#: What joints get at least (kg m^2, or kg): of the order of small motors behind their gears.
+_ARMATURE = 0.01
 #: How long a random control acts (s of simulated time).
 _HOLD = 0.02
+
+
+class Remedy(NamedTuple):
+    """What makes a model stable.
+
+    words: what was changed
+    model: a changed copy, an ``MjModel``
+    """
+
+    words: str
+    model: Any
 
 
 def instability(model: MjModel) -> str | None:
@@ -27,8 +43,110 @@ def instability(model: MjModel) -> str | None:
       model: an ``MjModel``; it stays as it is.
 
     Returns:
-      A line on where C MuJoCo meets numbers that are NaN or beyond 1e10 and what helps, under no
-      control or random ones in their range; None where it does not.
+      A line on where C MuJoCo meets numbers that are NaN or beyond 1e10, under no control or random
+      ones in their range, and which of the usual remedies helps; None where it does not.
+    """
+    explosion = _explosion(model, _WAIT)
+    if explosion is None:
+        return None
+    line = f"this model is unstable in C MuJoCo itself: {explosion}; "
+    stable = remedy(model)
+    if stable is None:
+        return f"{line}{', '.join(_TRIALS)} do not mend it: try softer servos"
+    return f"{line}with {stable.words} it is stable (python -m mjx_reinforce.new --fix writes it)"
+
+
+def remedy(model: MjModel) -> Remedy | None:
+    """Returns the first remedy that keeps an unstable model stable for a second in C MuJoCo.
+
+    Args:
+      model: an ``MjModel``; it stays as it is.
+
+    Returns:
+      None where the model is stable, or no remedy helps.
+    """
+    if _explosion(model, _WAIT) is None:
+        return None
+    for names in _COMBINATIONS:
+        copied = copy.copy(model)
+        words = [words for name in names if (words := _TRIALS[name](copied)) is not None]
+        # What MuJoCo derives of armatures, such as how soft contacts are.
+        _C.mj_setConst(copied, _C.MjData(copied))
+        if words and _explosion(copied, _TRIAL_WAIT, unfinished="not tried for a second") is None:
+            return Remedy(" and ".join(words), copied)
+    return None
+
+
+def _fast_implicit(model: Any) -> str | None:
+    """Integrates damping implicitly, which MJX has not with a fluid."""
+    fluid = model.opt.density or model.opt.viscosity or model.opt.wind.any()
+    if fluid or model.opt.integrator == _C.mjtIntegrator.mjINT_IMPLICITFAST:
+        return None
+    model.opt.integrator = _C.mjtIntegrator.mjINT_IMPLICITFAST
+    return 'integrator="implicitfast"'
+
+
+def _servo_damping(model: Any) -> str | None:
+    """Damps servos of joints critically: kv is twice the root of kp and the joint's inertia."""
+    stiffness = model.actuator_gainprm[:, 0]
+    is_servo = (stiffness > 0) & (model.actuator_biasprm[:, 1] == -stiffness)
+    is_servo &= model.actuator_trntype == _C.mjtTrn.mjTRN_JOINT
+    joints = model.actuator_trnid[is_servo, 0]
+    # Seen through the gear, as where MuJoCo computes kv from a dampratio.
+    inertia = model.dof_M0[model.jnt_dofadr[joints]] / model.actuator_gear[is_servo, 0] ** 2
+    damping = 2 * np.sqrt(stiffness[is_servo] * inertia)
+    # In the six digits of a file.
+    damping = np.array([float(f"{x:.6g}") for x in damping])
+    if np.all(damping <= -model.actuator_biasprm[is_servo, 2]):
+        return None
+    model.actuator_biasprm[is_servo, 2] = -np.maximum(damping, -model.actuator_biasprm[is_servo, 2])
+    least, most = (f"{x:.3g}" for x in (damping.min(), damping.max()))
+    return f"kv {least} of servos" if least == most else f"kv {least} to {most} of servos"
+
+
+def _armature(model: Any) -> str | None:
+    """Gives hinges and slides an inertia of their own."""
+    scalar = (_C.mjtJoint.mjJNT_HINGE, _C.mjtJoint.mjJNT_SLIDE)
+    dofs = model.jnt_dofadr[np.isin(model.jnt_type, scalar)]
+    if np.all(model.dof_armature[dofs] >= _ARMATURE):
+        return None
+    model.dof_armature[dofs] = np.maximum(model.dof_armature[dofs], _ARMATURE)
+    return f"armature {_ARMATURE:g} of joints"
+
+
+def _half_timestep(model: Any) -> str | None:
+    """Halves the timestep."""
+    model.opt.timestep /= 2
+    return f"timestep {model.opt.timestep:g}"
+
+
+#: What is tried, by what a message calls it.
+_TRIALS: dict[str, Callable[[Any], str | None]] = {
+    "implicitfast": _fast_implicit,
+    "damping of servos": _servo_damping,
+    f"armature {_ARMATURE:g}": _armature,
+    "half the timestep": _half_timestep,
+}
+_FAST, _DAMPING, _INERTIA, _HALF = _TRIALS
+#: In this order: first what costs nothing, last what costs speed.
+_COMBINATIONS = (
+    (_FAST,),
+    (_INERTIA,),
+    (_DAMPING,),
+    (_FAST, _DAMPING),
+    (_FAST, _INERTIA, _DAMPING),
+    (_HALF,),
+    (_FAST, _INERTIA, _DAMPING, _HALF),
+)
+
+
+def _explosion(model: MjModel, wait: float, unfinished: str | None = None) -> str | None:
+    """Returns under which controls and where a model explodes, if it does.
+
+    Args:
+      model: an ``MjModel``; it stays as it is.
+      wait: how long each kind of controls may take (s).
+      unfinished: what is returned if a second takes longer.
     """
     warning_texts: list[str] = []
     handler = _C.get_mju_user_warning()
@@ -36,21 +154,19 @@ def instability(model: MjModel) -> str | None:
     _C.set_mju_user_warning(warning_texts.append)
     try:
         for kind, controls in (("no control", _zero(model)), ("random controls", _random(model))):
-            if (explosion := _play(model, controls)) is not None:
-                return (
-                    f"this model is unstable in C MuJoCo itself: under {kind} it explodes after "
-                    f"{explosion}; try a smaller timestep, armature at the joints, "
-                    '<option integrator="implicitfast"/>, or softer servos'
-                )
+            deadline = time.perf_counter() + wait
+            if (place := _play(model, controls, deadline)) is not None:
+                return f"under {kind} it explodes after {place}"
+            if time.perf_counter() > deadline and unfinished is not None:
+                return unfinished
     finally:
         _C.set_mju_user_warning(handler)
     return None
 
 
-def _play(model: MjModel, controls: Iterator[np.ndarray]) -> str | None:
+def _play(model: MjModel, controls: Iterator[np.ndarray], deadline: float) -> str | None:
     """Returns after what time and where a model explodes under controls [A], if it does."""
     data = _C.MjData(model)
-    deadline = time.perf_counter() + _WAIT
     if model.nkey:
         _C.mj_resetDataKeyframe(model, data, 0)
     timestep = model.opt.timestep
@@ -59,7 +175,10 @@ def _play(model: MjModel, controls: Iterator[np.ndarray]) -> str | None:
     for step in range(round(_SECONDS / timestep)):
         if step % hold == 0:
             data.ctrl[:] = next(controls)
-        _C.mj_step(model, data)
+        try:
+            _C.mj_step(model, data)
+        except _C.FatalError as error:  # too many contacts, of parts that lie in each other
+            return f"{step * timestep:.3g} s ({str(error).splitlines()[0]})"
         if was_reset(data):
             return f"{step * timestep:.3g} s ({_place(model, data)})"
         if time.perf_counter() > deadline:

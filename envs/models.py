@@ -67,7 +67,8 @@ def load_model(xml_file: ModelSource) -> Any:
             model = _compile_model(MjSpec.compile, spec(xml_file), xml_file)
     # Said together with all that MJX would refuse, so that the file is mended once.
     if not model.nu:
-        check_supported(model, _name(xml_file), "it has no actuators; add an <actuator> element")
+        fault = "it has no actuators; add an <actuator> element, or call spec.add_actuator"
+        check_supported(model, _name(xml_file), fault)
     model.opt.enableflags &= ~_ONLY_REPORTS
     if is_off(model, "constraint"):  # C looks for no contacts then, MJX does
         model.opt.disableflags |= _C.mjtDisableBit.mjDSBL_CONTACT

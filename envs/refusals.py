@@ -1,7 +1,7 @@
 """What of a model would be simulated otherwise than by C MuJoCo, all at once and in words."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -82,6 +82,19 @@ _SOLREF = ("dof_{}", "eq_{}", "geom_{}", "jnt_{}", "pair_{}", "tendon_{}_lim", "
 _MAX_NAMED = 3
 
 
+class Difference(NamedTuple):
+    """Why contacts would be others than C's.
+
+    reason: in words
+    remedy: in words
+    of_margin: whether they would be the same without margin and gap
+    """
+
+    reason: str
+    remedy: str
+    of_margin: bool
+
+
 class UnsupportedError(BadEnvironmentError):
     """A model has what would be simulated otherwise than by C MuJoCo; the message says all of it.
 
@@ -146,7 +159,7 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
     ):
         narrow_ranges = np.flatnonzero(limited & (np.ptp(ends, axis=1) < 2 * margin))
         if narrow_ranges.size:
-            names = _listed([getattr(model, kind)(i).name or f"number {i}" for i in narrow_ranges])
+            names = listed([getattr(model, kind)(i).name or f"number {i}" for i in narrow_ranges])
             remedy = "give it a margin of at most half of its range"
             yield f"one of two limits that a {kind} meets at once ({names})", remedy
     refs = (getattr(model, field_format.format("solref")) for field_format in _SOLREF)
@@ -214,27 +227,33 @@ def _of_contacts(model: MjModel) -> Iterator[tuple[str, str]]:
     groups: dict[tuple[str, str], list[tuple[int, int]]] = {}
     for geom1, geom2, pair in geom_pairs(model):
         geoms = (int(geom1), int(geom2))
-        kinds = (int(model.geom_type[geom1]), int(model.geom_type[geom2]))
-        # The number of a <pair> element, which has a margin of its own, or -1.
-        margin = model.geom_margin[list(geoms)].sum() if pair < 0 else model.pair_margin[pair]
-        for reason in _unlike(kinds, margin):
-            groups.setdefault(reason, []).append(geoms)
+        for difference in unlike(model, *geoms, int(pair)):
+            groups.setdefault(difference[:2], []).append(geoms)
     # A sentence for all pairs of one reason: there may be hundreds of them.
     for (reason, remedy), pairs in groups.items():
         noun = "pairs" if len(pairs) > 1 else "pair"
-        sentence = f"{len(pairs):,} {noun} of {reason} ({_listed(_pair_names(model, pairs))})"
+        sentence = f"{len(pairs):,} {noun} of {reason} ({listed(_pair_names(model, pairs))})"
         yield sentence, remedy.format(exclude=_exclude(model, pairs))
     if model.opt.cone == _C.mjtCone.mjCONE_ELLIPTIC:
         frictionless = [pair for condim, *pair in geom_groups(model) if condim == 1]
         if frictionless:
-            names = _listed(_pair_names(model, frictionless))
+            names = listed(_pair_names(model, frictionless))
             count = len(frictionless)
             sentence = f"MJX has no contacts of condim 1 in elliptic cones: {count} ({names})"
             yield sentence, 'set <option cone="pyramidal"/> or condim="3"'
 
 
-def _unlike(kinds: tuple[int, int], margin: float) -> Iterator[tuple[str, str]]:
-    """Yields why contacts of geoms of two kinds would be others than C's, and a remedy."""
+def unlike(model: MjModel, geom1: int, geom2: int, pair: int) -> Iterator[Difference]:
+    """Yields why the contacts of two geoms would be others than C's, and a remedy.
+
+    Args:
+      model: the compiled model.
+      geom1: the number of the first geom, in the order of ``geom_pairs``.
+      geom2: that of the second.
+      pair: the number of their <pair> element, which has a margin of its own, or -1.
+    """
+    kinds = (int(model.geom_type[geom1]), int(model.geom_type[geom2]))
+    margin = model.geom_margin[[geom1, geom2]].sum() if pair < 0 else model.pair_margin[pair]
     names = " on ".join(_GEOM(kind).name[len("mjGEOM_") :].lower() for kind in reversed(kinds))
     # ``_of_contacts`` fills in an <exclude> of the first pair.
     advice = (
@@ -242,13 +261,14 @@ def _unlike(kinds: tuple[int, int], margin: float) -> Iterator[tuple[str, str]]:
         "spheres, capsules, boxes and planes"
     )
     if _GEOM.mjGEOM_SDF in kinds or not has_collider(*kinds):
-        yield f"{names}, which MJX has not", advice
+        yield Difference(f"{names}, which MJX has not", advice, of_margin=False)
     elif kinds in UNLIKE_C:
-        difference = UNLIKE_C[tuple(map(mjx.GeomType, kinds))]
-        yield f"{names}, {difference}", advice
+        reason = UNLIKE_C[tuple(map(mjx.GeomType, kinds))]
+        yield Difference(f"{names}, {reason}", advice, of_margin=False)
     elif margin and kinds in UNLIKE_C_WITHIN_MARGIN:
         remedy = "remove margin and gap from those geoms"
-        yield f"{names} with a margin or gap, which MJX ignores", remedy
+        reason = f"{names} with a margin or gap, which MJX ignores"
+        yield Difference(reason, remedy, of_margin=True)
 
 
 def _exclude(model: MjModel, pairs: Sequence[tuple[int, int]]) -> str:
@@ -274,7 +294,7 @@ def geom_name(model: MjModel, geom: int) -> str:
     return f"geom {geom - int(model.body_geomadr[body])} of body {body_name}"
 
 
-def _listed(names: Sequence[str]) -> str:
+def listed(names: Sequence[str]) -> str:
     """Returns the first names, and how many more there are."""
     text = ", ".join(names[:_MAX_NAMED])
     num_unnamed = len(names) - _MAX_NAMED

@@ -18,8 +18,11 @@ class NewSettings:
     """The model, .xml."""
     output: Path | None = None
     """The file to write, .py, in the folder of the model. By default the model's name."""
+    fix: bool = False
+    """Write a copy of the model, NAME_fixed.xml, with what makes it fast, accepted, and stable, and
+    the class for this copy. Each change is printed."""
     overwrite: bool = False
-    """Replace a file that exists."""
+    """Replace files that exist."""
 
 
 def main() -> None:
@@ -35,22 +38,22 @@ def write_class(settings: NewSettings) -> None:
         exists.
     """
     xml = settings.model
-    output = settings.output or xml.with_name(f"{re.sub(r'[^0-9a-zA-Z]+', '_', xml.stem)}.py")
     if xml.suffix.lower() != ".xml":
         raise ValueError(f"{xml} is not a model; give an MJCF file that ends in .xml")
+    if settings.fix:
+        xml = _write_fixed(settings)
+    output = settings.output or xml.with_name(f"{re.sub(r'[^0-9a-zA-Z]+', '_', xml.stem)}.py")
     check_module(output, "my_robot.py")
     if output.parent.resolve() != xml.parent.resolve():
         raise ValueError(f"{output} must be in the folder of {xml}, where it looks for the model")
     check_output(output, settings.overwrite, ".py")
     from mjx_reinforce.envs import models, refusals
     from mjx_reinforce.envs.instability import instability
+    from mjx_reinforce.envs.mending.ground import contact_counts
     from mjx_reinforce.templates import legged, model_class
     from mjx_reinforce.templates.facts import class_name
 
-    path = str(xml)
-    # A file's name alone would mean one of the package's own models.
-    if xml.parent == Path():
-        path = str(Path.cwd() / xml)
+    path = _path(xml)
     model = models.load_model(path)
     in_c = refusals.best_in_c(model)
     if in_c is None:
@@ -59,14 +62,52 @@ def write_class(settings: NewSettings) -> None:
     is_legged = legged.is_legged(model)
     template = legged if is_legged else model_class
     write_bytes(output, template.class_source(model, xml.name, module).encode())
-    command = "train legged" if is_legged else "train"
-    options = f"--env {module}:{class_name(module)} --output {module}_run"
-    if in_c is not None:
-        print(f"C MuJoCo will play it: {in_c}")
+    print(contact_counts(model))
+    print("machine code will play it" if in_c is None else f"C MuJoCo will play it: {in_c}")
     if (warning := instability(model)) is not None:
         print(warning)
+    if not settings.fix:
+        _offer_fix(path)
+    task = f"{module}:{class_name(module)}"
+    command = "train legged" if is_legged else "train"
     print(f"{output}: write its reward, then, in its folder:")
-    print(f"python -m mjx_reinforce.{command} {options}")
+    print(f"  python -m mjx_reinforce.{command} --env {task} --output {module}_run")
+
+
+def _path(xml: Path) -> str:
+    """Returns a path with a folder: a name alone would mean one of the package's own models."""
+    return str(Path.cwd() / xml if xml.parent == Path() else xml)
+
+
+def _write_fixed(settings: NewSettings) -> Path:
+    """Writes the mended copy of a model beside it, and returns its path, or that of the model.
+
+    Raises:
+      ValueError: the model cannot be loaded, or there is such a file already.
+    """
+    from mjx_reinforce.envs import models
+    from mjx_reinforce.envs.mending import edits
+
+    path = _path(settings.model)
+    models.load_model(path)  # says what it lacks
+    mended = edits.mend(path)
+    if not mended.edits:
+        print(f"{settings.model} needs no fix")
+        return settings.model
+    output = settings.model.with_name(f"{settings.model.stem}_fixed.xml")
+    check_output(output, settings.overwrite, ".xml")
+    write_bytes(output, mended.spec.to_xml().encode())
+    print(f"{output}:", *mended.edits, sep="\n  ")
+    return output
+
+
+def _offer_fix(path: str) -> None:
+    """Says what ``--fix`` would change in a model."""
+    from mjx_reinforce.envs.mending import edits
+
+    changes = edits.mend(path).edits
+    if changes:
+        print("--fix would write a copy with these changes:", *changes, sep="\n  ")
 
 
 if __name__ == "__main__":

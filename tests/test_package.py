@@ -65,7 +65,7 @@ FLOORS = [
     "vector",
 ]
 #: Commands of folders, found where ``python -m`` looks for them. They use what comes later.
-COMMANDS = {"envs.__main__"}
+COMMANDS = {"envs.__main__", "export.__main__"}
 #: Who may know that our environments exist; all others take any environment as an argument.
 MAY_IMPORT_ENVS = {
     *("envs", "settings", "training", "setup", "runs", "playing"),

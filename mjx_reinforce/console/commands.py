@@ -17,7 +17,7 @@ COMMANDS = {
         "train many configurations at once, and compare them",
     ),
     "report": ("mjx_reinforce.report:main", "make a page with figures of runs and sweeps"),
-    "export": ("mjx_reinforce.export.__main__:main", "write a policy for NumPy or for C"),
+    "export": ("mjx_reinforce.export.__main__:main", "write a policy for NumPy, C, or ONNX"),
     "new": ("mjx_reinforce.new:main", "write the class of a task for a MuJoCo model"),
     "envs": ("mjx_reinforce.envs.__main__:main", "list the tasks, or describe one"),
 }

@@ -12,7 +12,7 @@ from mjx_reinforce.settings.flags import run_command
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ExportSettings:
-    """Write a trained policy for NumPy alone, or for C as one header. It has no noise."""
+    """Write a trained policy for NumPy alone, for C as one header, or for ONNX, without noise."""
 
     run: tyro.conf.Positional[Path]
     """A run directory, or a task whose trained policy comes with the package."""
@@ -21,9 +21,13 @@ class ExportSettings:
     which: PolicyChoice = "last"
     """The policy at the end of training (last), or the best at any evaluation, if it was kept."""
     output: Path | None = None
-    """For NumPy the archive, .npz, beside which goes a short .py; for C and C++ the header, .h. By
-    default seed_NUMBER.npz in the run directory, or the name of the task and .npz in the current
-    folder for a policy of the package."""
+    """For NumPy the archive, .npz, beside which goes a short .py; for C and C++ the header, .h; for
+    ONNX the graph, .onnx, which needs mjx-reinforce[onnx]. By default seed_NUMBER.npz in the run
+    directory, or the name of the task and .npz in the current folder for a policy of the package.
+    """
+    env: str | None = None
+    """The task that the run was trained on, module:Class if it is your own. Its code runs, and what
+    it applies of an action, home + scale * action, comes into the files."""
     overwrite: bool = False
     """Replace files that exist."""
 
@@ -41,6 +45,8 @@ def export(settings: ExportSettings) -> list[Path]:
       OSError: a file cannot be written.
     """
     run = read_run(settings.run)
+    if settings.env not in (None, run.env):
+        raise ValueError(f"--env is {settings.env}, but {run.directory} was trained on {run.env}")
     from mjx_reinforce.export.arithmetic import policy_arithmetic
     from mjx_reinforce.export.c_header import c_header
     from mjx_reinforce.export.numpy_policy import numpy_policy
@@ -51,8 +57,20 @@ def export(settings: ExportSettings) -> list[Path]:
     outputs = output_files(settings, run, player.seed)
     name = outputs[0].stem
     arithmetic = policy_arithmetic(saved)
+    if settings.env is not None:
+        from mjx_reinforce import envs
+        from mjx_reinforce.export.control import affine_control
+
+        task = envs.make_set(run.env, run.env_set)
+        arithmetic = arithmetic._replace(control=affine_control(task))
+    run_name = run.directory.resolve().name
+    if outputs[0].suffix.lower() == ".onnx":
+        from mjx_reinforce.export.onnx_policy import onnx_policy
+
+        graph = onnx_policy(arithmetic, run_name, player.env, player.seed)
+        write_bytes(outputs[0], graph)
+        return outputs
     if outputs[0].suffix.lower() == ".h":
-        run_name = run.directory.resolve().name
         source = c_header(arithmetic, name, run_name, player.env, player.seed)
     else:
         arrays, source = numpy_policy(arithmetic, name, player.env, player.seed)
@@ -71,9 +89,11 @@ def output_files(settings: ExportSettings, run: Run, seed: int) -> list[Path]:
     if run.packaged:
         default_path = Path(f"{run.env.replace('-', '_')}.npz")
     output = settings.output or default_path
-    check_output(output, settings.overwrite, ".npz", ".h")
+    check_output(output, settings.overwrite, ".npz", ".h", ".onnx")
     if output.suffix.lower() == ".h":
         check_header(output, "policy.h")
+        return [output]
+    if output.suffix.lower() == ".onnx":
         return [output]
     module = output.with_suffix(".py")
     check_module(module, "policy.npz")

@@ -34,12 +34,16 @@ class Arithmetic(NamedTuple):
     head: what follows the last layer, of ``HEADS``
     bounds: what the head needs, [A] each: ``low`` and ``high``; for "tanh" also ``middle`` and
       ``half``; empty for "argmax"
+    frames: how many observations of the environment, the oldest first, are one of the policy's
+    control: what the task applies of an action, see ``affine_control``; empty where nobody asked
     """
 
     scale: Arrays
     layers: list[tuple[np.ndarray, np.ndarray]]
     head: Literal["clip", "tanh", "argmax"]
     bounds: Arrays
+    frames: int
+    control: Arrays
 
 
 def policy_arithmetic(saved: SavedPolicy) -> Arithmetic:
@@ -72,6 +76,8 @@ def policy_arithmetic(saved: SavedPolicy) -> Arithmetic:
         layers=[(weight.astype(np.float32), bias.astype(np.float32)) for weight, bias in layers],
         head=head,
         bounds=_single(bounds),
+        frames=int(saved.settings.get("frames", 1)),
+        control={},
     )
 
 

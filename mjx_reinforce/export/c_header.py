@@ -3,6 +3,7 @@
 import string
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,22 +29,28 @@ def c_header(arithmetic: Arithmetic, name: str, run: str, env: str, seed: int) -
     # A row is the bias of a unit and its weights, in the order in which the function reads them.
     units = [np.concatenate([bias[:, None], weight.T], axis=1).ravel() for weight, bias in layers]
     arrays = arithmetic.scale | {"network": np.concatenate(units)} | arithmetic.bounds
-    scaled = "observation[i]"
+    arrays |= arithmetic.control
+    scaled = "observation[i]" if arithmetic.frames == 1 else "state->frames[i]"
     if arithmetic.scale:
-        deviations = f"(observation[i] - {name}_mean[i]) / {name}_std[i]"
+        deviations = f"({scaled} - {name}_mean[i]) / {name}_std[i]"
         scaled = f"{name}_clip({deviations}, -{normalize.CLIP}f, {normalize.CLIP}f)"
     parts = _bounded(name, arithmetic.head)
     if arithmetic.head == "argmax":
         parts = _discrete(name)
-    template = Path(__file__).with_name("c_header.txt").read_text("utf-8")
-    return string.Template(template).substitute(
-        parts,
-        name=name,
-        NAME=name.upper(),
+    size = f"{name.upper()}_OBSERVATION_SIZE"
+    parts |= {"frames": "", "remember": "", "memory": "state", "count": size, "control": ""}
+    if arithmetic.frames > 1:
+        parts |= _remembering(name, arithmetic.frames, parts)
+    if arithmetic.control:
+        parts["control"] = _filled("c_header_control.txt", name)
+    return _filled(
+        "c_header.txt",
+        name,
+        **parts,
         run=ascii(run),
         env=ascii(env),
         seed=seed,
-        inputs=sizes[0],
+        inputs=sizes[0] // arithmetic.frames,
         outputs=sizes[-1],
         sizes=", ".join(map(str, sizes)),
         layers=len(layers),
@@ -53,6 +60,12 @@ def c_header(arithmetic: Arithmetic, name: str, run: str, env: str, seed: int) -
         arrays="\n".join(declaration(f"{name}_{key}", array) for key, array in arrays.items()),
         scaled=scaled,
     )
+
+
+def _filled(file: str, name: str, **placeholders: Any) -> str:
+    """Returns the text of a template with its placeholders filled in."""
+    template = string.Template(Path(__file__).with_name(file).read_text("utf-8"))
+    return template.substitute(placeholders, name=name, NAME=name.upper())
 
 
 def _bounded(name: str, head: str) -> dict[str, str]:
@@ -89,6 +102,21 @@ def _discrete(name: str) -> dict[str, str]:
         if (x[i] > x[greatest])
             greatest = i;
     return greatest;""",
+    }
+
+
+def _remembering(name: str, frames: int, parts: dict[str, str]) -> dict[str, str]:
+    """Returns the parts of the text that differ where the policy sees several observations."""
+    size = f"{name.upper()}_OBSERVATION_SIZE"
+    declared, _, call = parts["use"].rpartition(f"{name}_act(")
+    return {
+        "memory": "state of its own",
+        "count": f"{name.upper()}_FRAMES * {size}",
+        "use": f"struct {name}_state state; {name}_reset(&state);  // at an episode's start\n"
+        f"//     {declared}{name}_act(&state, {call}",
+        "arguments": f"struct {name}_state *state, {parts['arguments']}",
+        "frames": _filled("c_header_frames.txt", name, number=frames),
+        "remember": f"    {name}_remember(state, observation);\n",
     }
 
 

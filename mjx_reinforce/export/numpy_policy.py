@@ -24,7 +24,7 @@ def numpy_policy(arithmetic: Arithmetic, name: str, env: str, seed: int) -> tupl
       env: the id of the environment.
       seed: the number of the seed.
     """
-    arrays = arithmetic.scale | arithmetic.bounds
+    arrays = arithmetic.scale | arithmetic.bounds | arithmetic.control
     lines = []
     if arithmetic.scale:
         scaled = '(x - P["mean"]) / P["std"]'
@@ -38,15 +38,33 @@ def numpy_policy(arithmetic: Arithmetic, name: str, env: str, seed: int) -> tupl
             layer = f"np.tanh({layer})"
         lines.append(f"x = {layer}")
     lines.append(f"return {_ENDINGS[arithmetic.head]}")
-    inputs = len(layers[0][0])
+    inputs = len(layers[0][0]) // arithmetic.frames
     outputs = len(layers[-1][1])
-    shapes = f"[{inputs}] -> an integer, or [N, {inputs}] -> [N]"
+    results = ("an integer", "[N]")
     if arithmetic.head != "argmax":
-        shapes = (
-            f"[{inputs}] -> [{outputs}], or [N, {inputs}] -> [N, {outputs}]"
-            "\n\nActions are clipped to the range that the environment declared."
-        )
+        results = (f"[{outputs}]", f"[N, {outputs}]")
+    shapes = f"[{inputs}] -> {results[0]}"
+    if arithmetic.frames == 1:
+        shapes += f", or [N, {inputs}] -> {results[1]}"
+    if arithmetic.head != "argmax":
+        shapes += "\n\nActions are clipped to the range that the environment declared."
+    placeholders = {"use": "", "acting": name, "further": ""}
+    if arithmetic.frames > 1:
+        placeholders = {
+            "use": f"policy = {name}.Policy()  # one an episode\n    ",
+            "acting": "policy",
+            "further": _text("frames").format(size=inputs, number=arithmetic.frames),
+        }
+    if arithmetic.control:
+        placeholders["further"] += _text("control")
     template = Path(__file__).with_name("numpy_policy.txt").read_text("utf-8")
     body = "\n    ".join(lines)
-    source = template.format(name=name, shapes=shapes, env=ascii(env), seed=seed, body=body)
+    source = template.format(
+        name=name, shapes=shapes, env=ascii(env), seed=seed, body=body, **placeholders
+    )
     return arrays, source
+
+
+def _text(part: str) -> str:
+    """Returns what a module has more, where the policy sees several frames, or has a control."""
+    return Path(__file__).with_name(f"numpy_policy_{part}.txt").read_text("utf-8")

@@ -51,7 +51,8 @@ _HOME_OF_JOINTS = """\
         self.home = {pose}[self.mj_model.jnt_qposadr[joints]]
 """
 _LIMIT = """\
-        self.limit = {limit}  # the most that a servo does (N m)
+        # The most that a servo does (N m).
+        self.limit = {limit}
 """
 _START = """\
         joints = self.mj_model.jnt_qposadr[self.mj_model.actuator_trnid[:, 0]]

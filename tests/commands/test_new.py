@@ -15,6 +15,7 @@ from places import ROOT
 import mjx_reinforce as mr
 from mjx_reinforce import envs, new
 from mjx_reinforce.engine import choose
+from mjx_reinforce.envs.refusals import best_in_c
 
 EXAMPLES = ROOT / "experiments" / "examples"
 SENSED = """<mujoco><option timestep="0.002"/><worldbody>
@@ -181,8 +182,38 @@ def test_an_unstable_model_is_named(tmp_path, monkeypatch, capsys):
     assert "unstable in C MuJoCo itself: under no control it explodes after 0" in (
         said := capsys.readouterr().out
     )
-    assert "(DOF 0, joint 'j'); try a smaller timestep" in said
+    assert "(DOF 0, joint 'j'); implicitfast, damping of servos, armature" in said
+    assert "--fix" not in said  # no remedy helps
     assert sorted(path.name for path in tmp_path.iterdir()) == ["stiff.py", "stiff.xml"]
+
+
+def test_fix_writes_a_mended_copy_and_its_class(tmp_path, monkeypatch, capsys):
+    """Without it the same changes are named; a file is replaced on demand alone."""
+    text = SERVO.replace('kp="100"', 'kp="20000"').replace("<option", '<option solver="PGS"')
+    (tmp_path / "servo.xml").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    write(monkeypatch, "servo.xml")
+    offer = capsys.readouterr().out
+    assert "MJX has no mjSOL_PGS" in offer
+    assert not (tmp_path / "servo_fixed.xml").exists()
+    write(monkeypatch, "servo.xml", "--fix")
+    changes, _, rest = capsys.readouterr().out.partition("0 possible contacts")
+    assert changes.startswith('servo_fixed.xml:\n  solver="Newton" in place of PGS\n  integrator=')
+    assert changes.partition("\n")[2] in offer
+    assert "unstable" in offer
+    assert "unstable" not in rest
+    assert "machine code will play it\n" in rest
+    assert "servo_fixed:ServoFixed" in rest
+    assert (tmp_path / "servo.xml").read_text() == text
+    monkeypatch.syspath_prepend(tmp_path)
+    env = envs.make("servo_fixed:ServoFixed")
+    assert best_in_c(env.mj_model) is None  # but machine code
+    with pytest.raises(SystemExit, match="2"):
+        write(monkeypatch, "servo.xml", "--fix")
+    assert "servo_fixed.xml exists; pass --overwrite" in capsys.readouterr().err
+    write(monkeypatch, "servo_fixed.xml", "--fix", "--output", "twice.py")
+    assert "servo_fixed.xml needs no fix\n" in capsys.readouterr().out
+    assert sorted(path.name for path in tmp_path.glob("*.xml")) == ["servo.xml", "servo_fixed.xml"]
 
 
 WRONG = {

@@ -186,7 +186,7 @@ def test_names_in_files_stay_text(tmp_path, monkeypatch):
         ("größe.h", "no names that begin with 'größe'"),
         ("nowhere/policy.h", "cannot write to nowhere"),
         ("mine.h", "mine.h exists; pass --overwrite"),
-        ("policy.hpp", "--output must end in .npz or .h, got policy.hpp"),
+        ("policy.hpp", "--output must end in .npz or .h or .onnx, got policy.hpp"),
     ],
 )
 def test_bad_input_is_named(tmp_path, monkeypatch, capsys, output, message):

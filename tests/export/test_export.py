@@ -1,24 +1,16 @@
 """Policies outside this program: in NumPy alone, they act as here."""
 
-import importlib.util
 import subprocess
 import sys
 
 import numpy as np
 import pytest
-from exports import BOX, CASES, KERNEL, OBSERVATIONS, make, run_export
+from exports import BOX, CASES, KERNEL, OBSERVATIONS, import_file, make, run_export
 from saved_runs import change_arrays, change_env, make_run
 
 from mjx_reinforce import load
 from mjx_reinforce.export.arithmetic import HEADS
 from mjx_reinforce.registry import DISTRIBUTIONS
-
-
-def import_file(path):
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.mark.parametrize(
@@ -113,7 +105,7 @@ def test_a_policy_of_the_package_can_be_exported(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--output", "policy.onnx"], "--output must end in .npz or .h, got policy.onnx"),
+        (["--output", "policy.pt"], "--output must end in .npz or .h or .onnx, got policy.pt"),
         (["--output", "my-policy.npz"], "cannot import 'my-policy.py'"),
         (["--output", "class.npz"], "cannot import 'class.py'"),
         (["--output", "numpy.npz"], "cannot import 'numpy.py' beside"),

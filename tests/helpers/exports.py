@@ -1,5 +1,6 @@
 """Policies of all kinds that nobody trained, and how they are exported."""
 
+import importlib.util
 import sys
 
 import numpy as np
@@ -36,3 +37,11 @@ def run_export(monkeypatch, *arguments):
     """Runs the command line."""
     monkeypatch.setattr(sys, "argv", ["export", *map(str, arguments)])
     export.main()
+
+
+def import_file(path):
+    """Imports an exported module by its path."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

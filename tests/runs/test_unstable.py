@@ -3,7 +3,8 @@
 import mujoco
 import pytest
 
-from mjx_reinforce.envs.instability import instability
+from mjx_reinforce.envs import models
+from mjx_reinforce.envs.instability import instability, remedy
 
 TASK = """
 import jax.numpy as jnp
@@ -37,7 +38,8 @@ def test_c_mujoco_says_whether_and_where(tmp_path, monkeypatch):
     assert instability(read(STIFF.format(1))) is None
     said = instability(read(STIFF.format(1e9)))
     assert f"{SAID} 0.0" in said
-    assert "(DOF 0, joint 'x'); try a smaller timestep" in said
+    assert "(DOF 0, joint 'x'); implicitfast, damping of servos, armature 0.01, half" in said
+    assert said.endswith("do not mend it: try softer servos")
     calm = STIFF.format(1e9).replace("<option", '<option gravity="0 0 0"')
     assert "under random controls it explodes after 0" in instability(read(calm))
     key = '<keyframe><key qpos="1e11"/></keyframe></mujoco>'
@@ -45,6 +47,28 @@ def test_c_mujoco_says_whether_and_where(tmp_path, monkeypatch):
     assert "after 0 s (qpos 0, joint 'x')" in far
     assert mujoco.get_mju_user_warning() is before  # pyright: ignore[reportAttributeAccessIssue]
     assert not [*tmp_path.iterdir()]
+
+
+#: What mends a model -> the attributes of its servo.
+REMEDIES = {
+    'integrator="implicitfast"': 'kp="1" kv="5"',
+    "armature 0.01 of joints": 'kp="400"',
+    'integrator="implicitfast" and kv 3.98 of servos': 'kp="900"',
+    'integrator="implicitfast" and armature 0.01 of joints and kv 5.93 of servos and '
+    "timestep 0.005": 'kp="2000"',
+}
+
+
+@pytest.mark.parametrize("words", REMEDIES)
+def test_the_remedy_is_one_that_was_tried(words):
+    """It is the first after which a second passes in C MuJoCo; the model stays as it is."""
+    text = STIFF.replace('kp="{}"', REMEDIES[words])
+    model = mujoco.MjModel.from_xml_string(text)  # pyright: ignore[reportAttributeAccessIssue]
+    before = models.digest(model)
+    said = instability(model)
+    assert models.digest(model) == before
+    assert f"with {words} it is stable" in said
+    assert instability(remedy(model).model) is None
 
 
 @pytest.mark.slow

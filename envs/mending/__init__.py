@@ -1,0 +1,1 @@
+"""Mending: what makes a model that others wrote accepted, fast, and stable."""

@@ -1,0 +1,220 @@
+"""What a robot's program needs beside the network: the memory of observations, and the control."""
+
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from c_programs import COMPILERS, load_library, needs_compiler, pointer
+from exports import BOX, CASES, OBSERVATIONS, import_file, make, run_export
+from saved_runs import change_env, make_run
+
+from mjx_reinforce import envs, load
+from mjx_reinforce.registry import DISTRIBUTIONS
+
+FRAMES, LENGTH = 3, 250
+#: What a policy sees that remembers three observations, in episodes of 250 steps.
+STACKS = np.concatenate(
+    [
+        np.concatenate([episode[np.maximum(np.arange(LENGTH) - lag, 0)] for lag in (2, 1, 0)], 1)
+        for episode in OBSERVATIONS.reshape(-1, LENGTH, 4)
+    ]
+)
+TASK = """
+import jax.numpy as jnp
+import numpy as np
+from mujoco import MjSpec
+from mjx_reinforce import Box
+from mjx_reinforce.envs.base import MujocoEnv
+
+SPEC = MjSpec.from_string('''<mujoco><worldbody>
+  <body><joint name="a"/><geom size=".1"/><body><joint name="b"/><geom size=".1"/>
+  <body><joint name="c"/><geom size=".1"/></body></body></body></worldbody><actuator>
+  <position joint="a" ctrlrange="-1 1"/><position joint="b" ctrlrange=".1 2"/><motor joint="c"/>
+  </actuator></mujoco>''')
+
+class Servos(MujocoEnv):
+    def __init__(self):
+        super().__init__(
+            xml_file=SPEC, frame_skip=2, max_episode_steps=20, reward_threshold=None
+        )
+        self.action_space = Box(np.array([-3.0, -1.0, 0.5]), np.array([3.0, -0.5, 2.0]))
+
+    def initial(self, rng):
+        return jnp.zeros(3), jnp.zeros(3)
+
+    def control(self, action):
+        return jnp.array([0.1, 0.9, -1.8]) + jnp.array([0.5, 1.7, 0.3]) * action
+
+    def outcome(self, before, data, action):
+        return 0.0, False, {}
+
+class Bent(Servos):
+    def control(self, action):
+        return jnp.tanh(action)
+
+class Mixed(Servos):
+    def control(self, action):
+        return action[::-1]
+"""
+
+
+def remembering_run(folder):
+    return make_run(folder, "InvertedPendulum-v5", observation_size=12, frames=FRAMES, **BOX)
+
+
+def task_run(folder, monkeypatch, name="Servos"):
+    (folder / "servos_of_test.py").write_text(TASK)
+    monkeypatch.syspath_prepend(folder)
+    run = make_run(folder / "run", "InvertedPendulum-v5", **BOX)
+    change_env(run, f"servos_of_test:{name}")
+    return run
+
+
+def controls(actions):
+    """Returns what the task applies of actions, and MuJoCo clamps to the ranges of actuators."""
+    task = envs.make("servos_of_test:Servos")
+    low, high = [-1, 0.1, -np.inf], [1, 2, np.inf]
+    return np.clip([task.control(jnp.asarray(action)) for action in actions], low, high)
+
+
+#: Functions that both languages have.
+CALLS = """\
+#include "walk.h"
+#ifdef __cplusplus
+extern "C" {
+#endif
+void act(int count, const float *observations, float *actions);
+void act(int count, const float *observations, float *actions) {
+    struct walk_state state;
+    for (int n = 0; n < count; n++) {
+        if (n % 250 == 0)
+            walk_reset(&state);
+        walk_act(&state, observations + n * WALK_OBSERVATION_SIZE, actions + n * WALK_ACTION_SIZE);
+    }
+}
+#ifdef __cplusplus
+}
+#endif
+"""
+
+
+@needs_compiler
+@pytest.mark.parametrize("language", COMPILERS)
+def test_a_header_remembers_the_last_observations(tmp_path, monkeypatch, language):
+    run = remembering_run(tmp_path)
+    run_export(monkeypatch, run, "--output", tmp_path / "walk.h")
+    library = load_library(tmp_path, CALLS, language)
+    observations = np.ascontiguousarray(OBSERVATIONS, np.float32)
+    actions = np.full((len(observations), 3), np.nan, np.float32)
+    library.act(len(observations), pointer(observations), pointer(actions))
+    np.testing.assert_allclose(actions, load(run).act(STACKS), atol=1e-5)
+
+
+def test_a_module_remembers_the_last_observations(tmp_path, monkeypatch):
+    run = remembering_run(tmp_path)
+    run_export(monkeypatch, run, "--output", tmp_path / "walk.npz")
+    module = import_file(tmp_path / "walk.py")
+    policy = module.Policy()
+    observation = np.empty(4)  # a program may write each into the same array
+    actions = []
+    for step, numbers in enumerate(OBSERVATIONS):
+        observation[:] = numbers
+        if step % LENGTH == 0:
+            policy.reset()
+        actions.append(policy.act(observation))
+    np.testing.assert_allclose(actions, load(run).act(STACKS), atol=1e-5)
+    assert "action = policy.act(observation)  # [4] -> [3]\n" in module.__doc__
+
+
+@needs_compiler
+def test_the_control_of_the_task_comes_into_the_files(tmp_path, monkeypatch):
+    run = task_run(tmp_path, monkeypatch)
+    for name in ("walk.h", "walk.npz"):
+        run_export(monkeypatch, run, "--env", "servos_of_test:Servos", "--output", tmp_path / name)
+    actions = np.random.default_rng(0).uniform(-3, 3, size=(1000, 3)).astype(np.float32)
+    expected = controls(actions)
+    assert (expected[:, 0] == 1).any()
+    np.testing.assert_allclose(import_file(tmp_path / "walk.py").control(actions), expected, 1e-5)
+    code = """#include "walk.h"\nvoid apply(float *x);\nvoid apply(float *x) {
+    float ctrl[WALK_ACTION_SIZE];
+    walk_control(x, ctrl);
+    for (int i = 0; i < WALK_ACTION_SIZE; i++) x[i] = ctrl[i];\n}\nvoid act(float *x);
+    void act(float *x) { walk_act(x, x); }"""
+    library = load_library(tmp_path, code)
+    for action, control in zip(actions, expected, strict=True):
+        library.apply(pointer(action))
+        np.testing.assert_allclose(action, control, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("servos_of_test:Bent", "control of Bent is not home + scale * action"),
+        ("servos_of_test:Mixed", "control of Mixed is not home + scale * action"),
+        ("servos_of_test:Other", "was trained on servos_of_test:Servos"),
+    ],
+)
+def test_a_control_of_another_kind_is_refused(tmp_path, monkeypatch, capsys, name, message):
+    kind = name.partition(":")[2]
+    run = task_run(tmp_path, monkeypatch, "Servos" if kind == "Other" else kind)
+    with pytest.raises(SystemExit, match="2"):
+        run_export(monkeypatch, run, "--env", name, "--output", tmp_path / "walk.h")
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "walk.h").exists()
+
+
+def onnx_session(path):
+    pytest.importorskip("onnx").checker.check_model(str(path))
+    return pytest.importorskip("onnxruntime").InferenceSession(str(path))
+
+
+@pytest.mark.parametrize(
+    ("family", "case"),
+    [*((x, "linear") for x in DISTRIBUTIONS), *(("normal", x) for x in CASES if x != "linear")],
+)
+def test_a_graph_acts_as_ours(tmp_path, monkeypatch, family, case):
+    pytest.importorskip("onnx")
+    run = make(tmp_path, family, case)
+    run_export(monkeypatch, run, "--output", tmp_path / "walk.onnx")
+    session = onnx_session(tmp_path / "walk.onnx")
+    observations = OBSERVATIONS.astype(np.float32)
+    (actions,) = session.run(None, {"observation": observations})
+    expected = load(run).act(observations)
+    assert actions.shape == expected.shape
+    np.testing.assert_allclose(actions, expected, atol=1e-5)
+    observations[:, 1] = np.nan
+    (actions,) = session.run(None, {"observation": observations})
+    assert family == "categorical" or np.isnan(actions).all()
+
+
+def test_a_graph_is_given_the_last_observations(tmp_path, monkeypatch):
+    pytest.importorskip("onnx")
+    run = remembering_run(tmp_path)
+    run_export(monkeypatch, run, "--output", tmp_path / "walk.onnx")
+    session = onnx_session(tmp_path / "walk.onnx")
+    frames, actions = None, []
+    for step, observation in enumerate(OBSERVATIONS.astype(np.float32)):
+        if step % LENGTH == 0:
+            frames = np.tile(observation, (1, FRAMES))
+        inputs = {"observation": observation[None], "frames": frames}
+        action, frames = session.run(["action", "next_frames"], inputs)
+        actions.append(action[0])
+    np.testing.assert_allclose(actions, load(run).act(STACKS), atol=1e-5)
+
+
+def test_a_graph_has_the_control_of_the_task(tmp_path, monkeypatch):
+    pytest.importorskip("onnx")
+    run = task_run(tmp_path, monkeypatch)
+    output = tmp_path / "walk.onnx"
+    run_export(monkeypatch, run, "--env", "servos_of_test:Servos", "--output", output)
+    observations = OBSERVATIONS.astype(np.float32)
+    action, ctrl = onnx_session(output).run(["action", "ctrl"], {"observation": observations})
+    np.testing.assert_allclose(ctrl, controls(action), rtol=1e-5)
+
+
+def test_what_is_not_installed_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(SystemExit, match="2"):
+        run_export(monkeypatch, make_run(tmp_path), "--output", tmp_path / "walk.onnx")
+    assert "pip install 'mjx-reinforce[onnx]'" in capsys.readouterr().err
