@@ -529,8 +529,9 @@ class MujocoEnv(Env):
         sound = jax.ShapeDtypeStruct((), bool)
         operands = [getattr(start, field) for field in ("ctrl", *models.CARRIED)]
         fields = models.replaced(episode) | constants
-        if self._random_fields and self._is_in_device_code:
-            operands.append(tables.drawn_numbers(self.mj_model, self._random_fields, fields))
+        if (self._random_fields or self.mj_model.nmocap) and self._is_in_device_code:
+            drawn = fields | {name: getattr(start, name) for name in MOCAP}
+            operands.append(tables.drawn_numbers(self.mj_model, self._random_fields, drawn))
         digest = self.physics_model().digest
         touch = jnp.zeros(len(last_pass.touch_sensors(self.mj_model)), start.qpos.dtype)
         last = {"pass_qpos": start.qpos, "pass_qvel": start.qvel, "pass_qacc": start.qacc}

@@ -105,7 +105,6 @@ def _lacking_parts(model: Any) -> Iterable[tuple[str, Any]]:
     yield f"more than {MAX_DOFS} degrees of freedom", model.nv > MAX_DOFS
     yield f"{_MAX_GEOMS} geoms or more", model.ngeom >= _MAX_GEOMS
     yield "flexes or plugins", model.nflex or model.nplugin
-    yield "mocap bodies", model.nmocap
     pulling = pulling_tendons(model)
     wrap_tendons = np.repeat(np.arange(model.ntendon), model.tendon_num)
     wraps = model.wrap_type[np.isin(wrap_tendons, pulling)]
@@ -211,8 +210,12 @@ def meeting(model: Any) -> list[GeomPair]:
     if not flags.has_contacts(model):
         return []
     pair_keys = ((int(pair), *sorted((int(g), int(h)))) for g, h, pair in geom_pairs(model))
+    # C leaves out contacts of two bodies that nothing moves, such as a mocap body and the world.
+    is_moved = model.body_treeid[model.geom_bodyid] >= 0
     pairs = []
     for pair, *geoms in sorted(pair_keys):
+        if not is_moved[geoms].any():
+            continue
         flat_geom, round_geom = sorted(geoms, key=model.geom_type.__getitem__)
         pairs.append(GeomPair(flat_geom, round_geom, pair))
     return pairs
