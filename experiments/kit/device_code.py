@@ -22,8 +22,8 @@ COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
 STATE = ("qpos", "qvel", "qacc_warmstart")
 
 #: (state by the names of ``STATE``, which changes in place; controls [nu]; number of steps; the
-#: numbers of ``tables.drawn_numbers``, by default those of the model itself) -> what the last step reports, by the
-#: names of ``report_sizes``.
+#: numbers of ``tables.drawn_numbers``, by default those of the model itself) -> what the last step
+#: reports, by the names of ``report_sizes``.
 Steps = Callable[..., dict[str, np.ndarray]]
 
 
