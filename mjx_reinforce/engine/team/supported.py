@@ -9,7 +9,7 @@ import numpy as np
 
 from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.physics.early_stop import stops_early
-from mjx_reinforce.engine.physics.mjx_internals import geom_pairs
+from mjx_reinforce.engine.physics.mjx_internals import meeting_pairs
 from mjx_reinforce.engine.team import flags
 
 _C: Any = mujoco  # a C extension without stubs
@@ -209,13 +209,9 @@ def meeting(model: Any) -> list[GeomPair]:
     """Returns the pairs of geoms that may meet, the flatter first; those of C's choice lead."""
     if not flags.has_contacts(model):
         return []
-    pair_keys = ((int(pair), *sorted((int(g), int(h)))) for g, h, pair in geom_pairs(model))
-    # C leaves out contacts of two bodies that nothing moves, such as a mocap body and the world.
-    is_moved = model.body_treeid[model.geom_bodyid] >= 0
+    pair_keys = ((int(pair), *sorted((int(g), int(h)))) for g, h, pair in meeting_pairs(model))
     pairs = []
     for pair, *geoms in sorted(pair_keys):
-        if not is_moved[geoms].any():
-            continue
         flat_geom, round_geom = sorted(geoms, key=model.geom_type.__getitem__)
         pairs.append(GeomPair(flat_geom, round_geom, pair))
     return pairs
