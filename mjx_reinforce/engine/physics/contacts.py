@@ -45,7 +45,6 @@ from jax import lax
 from mujoco import mjx
 
 from mjx_reinforce.engine.physics import boxes, inertia, mjx_internals
-from mjx_reinforce.engine.physics.kinematics import kinematics
 from mjx_reinforce.engine.physics.mjx_internals import Collision, GeomInfo, collider, make_frame
 from mjx_reinforce.engine.physics.rows import make_constraint
 from mjx_reinforce.engine.scalar import is_written_out, short_scan
@@ -392,7 +391,7 @@ make_data = mjx_internals.data_with(_functions)
 def fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Computes what depends on position: ``mjx.fwd_position`` with this module's contacts."""
     # The stages of ``mj_fwdPosition``. MJX's function binds its own collisions and rows.
-    data = kinematics(model, data)
+    data = mjx_internals.kinematics(model, data)
     data = mjx.com_pos(model, data)
     data = mjx.camlight(model, data)
     data = mjx.tendon(model, data)

@@ -155,6 +155,20 @@ def meeting_pairs(model: Any) -> Iterator[tuple[int, int, int]]:
             yield geom1, geom2, pair
 
 
+def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Computes poses as ``mjx.kinematics(model, data)``, and of what mocap bodies carry as C.
+
+    MJX moves mocap bodies last, and leaves their children where the model has them.
+    """
+    if not model.nmocap:
+        return mjx.kinematics(model, data)
+    is_mocap = model.body_mocapid >= 0
+    quat = data.mocap_quat / jnp.linalg.norm(data.mocap_quat, axis=1, keepdims=True)
+    body_pos = jnp.asarray(model.body_pos).at[is_mocap].set(data.mocap_pos)
+    body_quat = jnp.asarray(model.body_quat).at[is_mocap].set(quat)
+    return mjx.kinematics(model.replace(body_pos=body_pos, body_quat=body_quat), data)
+
+
 def collision_with(
     functions: Callable[[_Colliders], _Colliders],
 ) -> Callable[[mjx.Model, mjx.Data], mjx.Data]:

@@ -293,9 +293,8 @@ class _Tables:
         for body in range(1, model.nbody):
             parent = self.frames[model.body_parentid[body]]
             frame = parent.then(model.body_pos[body], model.body_quat[body])
-            mocap = model.body_mocapid[body]
-            if mocap >= 0:
-                frame = Frame(-2 - mocap, np.zeros(3), identity)
+            if model.body_mocapid[body] >= 0:
+                frame = Frame(-2 - model.body_mocapid[body], np.zeros(3), identity)
             start = model.body_jntadr[body]
             # The joints of a body are a chain: each moves the frame of the next.
             for joint in range(start, start + model.body_jntnum[body]):

@@ -360,6 +360,7 @@ STILL = """
 </mujoco>"""
 
 
+@pytest.mark.slow
 def test_bodies_that_nothing_moves_do_not_touch():
     """C leaves out contacts of mocap bodies with the world and with each other."""
     model = mujoco.MjModel.from_xml_string(STILL)  # pyright: ignore

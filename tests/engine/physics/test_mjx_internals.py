@@ -68,7 +68,7 @@ SOURCES = {
     "collision_primitive.sphere_capsule": ("47fc429aae7a2ac6", "contacts.sphere_capsule"),
     "collision_primitive.capsule_capsule": ("a09b10b02f182204", "contacts.capsule_capsule"),
     "sensor.sensor_acc": ("54ba32544e29725b", "sensors (what it leaves out)"),
-    "smooth.kinematics": ("92beade60af6e6f9", "kinematics (when mocap bodies move)"),
+    "smooth.kinematics": ("92beade60af6e6f9", "mjx_internals.kinematics"),
     "smooth.rne_postconstraint": ("bd9282d1448b35f4", "sensors (what it leaves out)"),
     "smooth.tendon": ("388e2cb427608f21", "tendons (which pieces), mjx_internals.wrap_points"),
     "smooth.tendon_dot": ("2fcfed9813567531", "tendons"),
