@@ -60,6 +60,11 @@ def _carried(state: "Physics | mjx.Data") -> dict[str, jax.Array]:
     return {name: getattr(state, name) for name in models.CARRIED}
 
 
+def _constant(start: mjx.Data) -> dict[str, jax.Array]:
+    """Returns what no physics step changes of a simulation."""
+    return {name: getattr(start, name) for name in models.CONSTANT}
+
+
 def _mocap(fields: dict[str, jax.Array]) -> dict[str, jax.Array]:
     """Returns the poses of mocap bodies among fields of a start, or of what is carried."""
     return {name: fields[name] for name in MOCAP if name in fields}
@@ -537,8 +542,9 @@ class MujocoEnv(Env):
         sound = jax.ShapeDtypeStruct((), bool)
         operands = [getattr(start, field) for field in ("ctrl", *models.CARRIED)]
         fields = models.replaced(episode) | constants
-        if self._random_fields and self._is_in_device_code:
-            operands.append(tables.drawn_numbers(self.mj_model, self._random_fields, fields))
+        if (self._random_fields or self.mj_model.nmocap) and self._is_in_device_code:
+            drawn = fields | {name: getattr(start, name) for name in MOCAP}
+            operands.append(tables.drawn_numbers(self.mj_model, self._random_fields, drawn))
         digest = self.physics_model().digest
         touch = jnp.zeros(len(last_pass.touch_sensors(self.mj_model)), start.qpos.dtype)
         last = {"pass_qpos": start.qpos, "pass_qvel": start.qvel, "pass_qacc": start.qacc}
@@ -546,7 +552,7 @@ class MujocoEnv(Env):
         outputs = whole(name, results | last, *operands, model=digest)
         # In the order of ``results``, which is that of the tree's leaves.
         *leaves, qpos, qvel, qacc, touch, is_sound = outputs.values()
-        data = tree.unflatten(leaves)
+        data = tree.unflatten(leaves).replace(**_constant(start))
         last_data = start.replace(qpos=qpos, qvel=qvel, qacc=qacc)
         last_data = mjx_internals.with_fields(last_data, cfrc_ext=Simulation(data).cfrc_ext)
 
@@ -558,9 +564,8 @@ class MujocoEnv(Env):
 
     def _before(self, state: Physics, start: mjx.Data) -> Before:
         """Returns what a task knows of the start of an env step."""
-        constant = {name: getattr(start, name) for name in models.CONSTANT}
         # The state's own come last: a task may have asked to carry one of these, too.
-        state_fields = constant | state.carried | _carried(state)
+        state_fields = _constant(start) | state.carried | _carried(state)
         return Before(state_fields, self.mj_model, state.episode, state.memory)
 
     def _outcome(self, before: Before, data: View, action: jax.Array) -> Any:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from mjx_reinforce.engine.team import tables
@@ -20,9 +21,9 @@ COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
 #: What a simulation carries from step to step.
 STATE = ("qpos", "qvel", "qacc_warmstart")
 
-#: (state by the names of ``STATE``, which changes in place; controls [nu]; number of steps; where
-#: fields are random the numbers of ``tables.drawn_numbers``) -> what the last step reports, by the
-#: names of ``report_sizes``.
+#: (state by the names of ``STATE``, which changes in place; controls [nu]; number of steps; the
+#: numbers of ``tables.drawn_numbers``, by default those of the model itself) -> what the last step
+#: reports, by the names of ``report_sizes``.
 Steps = Callable[..., dict[str, np.ndarray]]
 
 
@@ -72,6 +73,8 @@ def compiled(
     play_steps = ctypes.CDLL(str(library)).play_steps
     sizes = report_sizes(model)
     ends = np.cumsum([*sizes.values()])
+    with jax.enable_x64(True):
+        own_numbers = np.array(tables.drawn_numbers(model, random, {}))
 
     def play(
         state: dict[str, np.ndarray],
@@ -83,7 +86,7 @@ def compiled(
         ctrl = np.resize(control, max(model.nu, 1)).astype(float)
         report = np.zeros(ends[-1])
         numbers = [state[name] for name in STATE]
-        drawn = np.zeros(0) if drawn is None else drawn
+        drawn = own_numbers if drawn is None else drawn
         start = [_pointer(x) for x in (*numbers, ctrl, drawn)]
         play_steps(*start, num_steps, _pointer(report))
         return dict(zip(sizes, np.split(report, ends[:-1]), strict=True))

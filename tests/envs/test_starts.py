@@ -16,12 +16,13 @@ from mjx_reinforce.envs.in_mujoco import InMujoco
 
 #: MuJoCo's own names; it is a C extension without stubs.
 mujoco: Any = mujoco_bindings
-#: A finger with a servo and an actuator that has a state, held by a spring to a mocap body.
+#: A finger with a servo and an actuator that has a state, held by a spring to what a mocap body
+#: carries.
 MODEL = """
 <mujoco>
   <option timestep="0.004"/>
   <worldbody>
-    <body name="hand" mocap="true" pos="0 0 1"/>
+    <body name="hand" mocap="true" pos="0 0 1"><body name="palm" pos="0 .02 0"/></body>
     <body name="upper" pos="0 0 1">
       <joint name="shoulder" axis="0 1 0" damping=".1"/>
       <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/>
@@ -32,7 +33,7 @@ MODEL = """
       </body>
     </body>
   </worldbody>
-  <equality><connect body1="hand" body2="lower" anchor=".6 0 0" solref=".3 1"/></equality>
+  <equality><connect body1="palm" body2="lower" anchor=".6 0 0" solref=".3 1"/></equality>
   <actuator>
     <position name="servo" joint="shoulder" kp="5" ctrlrange="-2 2"/>
     <general name="muscle" joint="elbow" dyntype="filter" dynprm=".2" gainprm="2"/>
@@ -72,7 +73,7 @@ class Finger(MujocoEnv):
     def observe(self, data):
         hand = data.body("hand")
         fields = [data.qpos, data.qvel, data.act, data.ctrl, data.qacc, hand.xpos, hand.xquat]
-        return jnp.concatenate(fields)
+        return jnp.concatenate([*fields, data.body("palm").xpos])
 
 
 def from_open(env, rng):
@@ -118,7 +119,8 @@ class SteppedByC:
     def observe(self):
         data = self.data
         fields = [data.qpos, data.qvel, data.act, data.ctrl, data.qacc]
-        return np.concatenate([*fields, data.body("hand").xpos, data.body("hand").xquat])
+        hand = data.body("hand")
+        return np.concatenate([*fields, hand.xpos, hand.xquat, data.body("palm").xpos])
 
 
 def compare_with_c(env, task, key, tolerance):

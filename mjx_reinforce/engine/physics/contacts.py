@@ -391,7 +391,7 @@ make_data = mjx_internals.data_with(_functions)
 def fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Computes what depends on position: ``mjx.fwd_position`` with this module's contacts."""
     # The stages of ``mj_fwdPosition``. MJX's function binds its own collisions and rows.
-    data = mjx.kinematics(model, data)
+    data = mjx_internals.kinematics(model, data)
     data = mjx.com_pos(model, data)
     data = mjx.camlight(model, data)
     data = mjx.tendon(model, data)

@@ -85,6 +85,10 @@ check_lookup(mjx.collision, "_COLLISION_FUNC")
 check_lookup(collision_driver.make_condim, "_COLLISION_FUNC")
 check_lookup(io._make_data_jax, "collision_driver")
 check_lookup(mjx.make_constraint, "_kbi")
+check_lookup(collision_driver._geom_groups, "geom_pairs")
+check_lookup(collision_driver._contact_groups, "_geom_groups")
+check_lookup(mjx.collision, "_contact_groups")
+check_lookup(collision_driver.make_condim, "_geom_groups")
 check_lookup(scan.flat, "_nvmap")
 check_lookup(scan.body_tree, "_nvmap")
 
@@ -140,10 +144,35 @@ def wrap_points(
 _Colliders = dict[tuple[mjx.GeomType, mjx.GeomType], Callable[..., Any]]
 
 
+def meeting_pairs(model: Any) -> Iterator[tuple[int, int, int]]:
+    """Yields ``geom_pairs`` of a model without those that nothing moves, which C leaves out, too.
+
+    MJX has contacts of mocap bodies with the world and with each other, whose forces are of no use.
+    """
+    is_moved = model.body_treeid[model.geom_bodyid] >= 0
+    for geom1, geom2, pair in geom_pairs(model):
+        if is_moved[geom1] or is_moved[geom2]:
+            yield geom1, geom2, pair
+
+
+def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Computes poses as ``mjx.kinematics(model, data)``, and of what mocap bodies carry as C.
+
+    MJX moves mocap bodies last, and leaves their children where the model has them.
+    """
+    if not model.nmocap:
+        return mjx.kinematics(model, data)
+    is_mocap = model.body_mocapid >= 0
+    quat = data.mocap_quat / jnp.linalg.norm(data.mocap_quat, axis=1, keepdims=True)
+    body_pos = jnp.asarray(model.body_pos).at[is_mocap].set(data.mocap_pos)
+    body_quat = jnp.asarray(model.body_quat).at[is_mocap].set(quat)
+    return mjx.kinematics(model.replace(body_pos=body_pos, body_quat=body_quat), data)
+
+
 def collision_with(
     functions: Callable[[_Colliders], _Colliders],
 ) -> Callable[[mjx.Model, mjx.Data], mjx.Data]:
-    """Returns a copy of ``mjx.collision`` with other collision functions.
+    """Returns a copy of ``mjx.collision`` with other collision functions, of ``meeting_pairs``.
 
     MJX finds its collision functions in one table, a global of a module; the copy has a table of
     its own, and MJX stays as it is.
@@ -153,7 +182,8 @@ def collision_with(
         makes the copy's.
     """
     colliders = functions(dict(collision_driver._COLLISION_FUNC))
-    return _copy(mjx.collision, _COLLISION_FUNC=colliders)
+    groups = _copy(collision_driver._contact_groups, _geom_groups=_geom_groups)
+    return _copy(mjx.collision, _COLLISION_FUNC=colliders, _contact_groups=groups)
 
 
 def rows_with(kbi: Callable[..., Any]) -> Callable[[mjx.Model, mjx.Data], mjx.Data]:
@@ -183,11 +213,13 @@ def data_with(functions: Callable[[_Colliders], _Colliders]) -> Callable[..., mj
     """
     # MJX's function asks ``collision_driver`` for dimensions; the copy asks this stand-in.
     colliders = functions(dict(collision_driver._COLLISION_FUNC))
-    make_condim = _copy(collision_driver.make_condim, _COLLISION_FUNC=colliders)
+    names = {"_COLLISION_FUNC": colliders, "_geom_groups": _geom_groups}
+    make_condim = _copy(collision_driver.make_condim, **names)
     driver = types.SimpleNamespace(make_condim=make_condim)
     return _copy(io._make_data_jax, collision_driver=driver)
 
 
+_geom_groups = _copy(collision_driver._geom_groups, geom_pairs=meeting_pairs)
 _lock = threading.RLock()
 _level = scan._nvmap
 

@@ -65,7 +65,8 @@ def _with_changes(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
     def speed(qpos: jax.Array) -> jax.Array:
         """Returns J(qpos) qvel [rows] of the connects and welds, at the velocity of the data."""
-        moved_data = mjx.com_pos(model, mjx.kinematics(model, no_contact.replace(qpos=qpos)))
+        moved_data = mjx_internals.kinematics(model, no_contact.replace(qpos=qpos))
+        moved_data = mjx.com_pos(model, moved_data)
         return jax_fields(make_rows(model, moved_data)).efc_J[:num_rows] @ data.qvel
 
     # The acceleration of a row is J qacc + dJ/dt qvel. The second is known before the solver, which

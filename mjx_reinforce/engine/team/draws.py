@@ -1,7 +1,8 @@
 """Fields of a model that differ from episode to episode, in the tables of the device code.
 
 A team has the tables that depend on such fields in its state. The program of a task computes their
-entries from what ``MujocoEnv.randomize`` drew, and from what MuJoCo derives of that.
+entries from what ``MujocoEnv.randomize`` drew, and from what MuJoCo derives of that. Poses of mocap
+bodies, of mjData, are always among these tables.
 """
 
 import enum
@@ -51,7 +52,7 @@ def entries(tables: Any, random: Collection[str], fields: Mapping[str, Any]) -> 
       tables: those of ``tables.py``.
       random: the names of the fields, of ``effective``.
       fields: what an episode has in place of the model's fields, and what follows from it, by
-        their names in mjModel.
+        their names in mjModel; and ``mocap_pos`` and ``mocap_quat``.
     """
     parts: Entries = {}
     model = _Episode(tables.model, fields)
@@ -72,6 +73,8 @@ def entries(tables: Any, random: Collection[str], fields: Mapping[str, Any]) -> 
     parts |= _actuators(tables, model, random)
     if "geom_friction" in random:
         parts["geom_friction", ""] = model.geom_friction[tables.geoms]
+    for field in ("mocap_pos", "mocap_quat"):
+        parts[field, ""] = fields.get(field, tables.reals[field])
     return {key: part for key, part in parts.items() if np.size(tables.reals[key[0]])}
 
 
@@ -99,14 +102,14 @@ def _bodies(tables: Any, model: Any, random: Collection[str]) -> Entries:
     by_moment = axes[:, _ROWS] * axes[:, _COLUMNS]
     inertia = (by_moment @ model.body_inertia[:, :, None])[:, :, 0]
 
-    links = np.array([x.link for x in frames])
+    links = np.array([max(x.link, -1) for x in frames])
     is_of_link = (np.arange(tables.model.njnt)[:, None] == links).astype(float)
     link_mass = is_of_link @ mass
     moment = is_of_link @ (mass[:, None] * com)
     link_com = jnp.where(
         link_mass[:, None] != 0, moment / jnp.maximum(link_mass, MIN_VALUE)[:, None], 0
     )
-    # The parallel axis theorem; what the world carries counts for no link.
+    # The parallel axis theorem; what the world and mocap bodies carry counts for no link.
     arm = com - link_com[links]
     shift = (arm * arm).sum(1)[:, None] * (_ROWS == _COLUMNS) - arm[:, _ROWS] * arm[:, _COLUMNS]
     held = (mass * model.body_gravcomp)[:, None] * jnp.column_stack([com, jnp.ones(len(com))])

@@ -11,7 +11,7 @@ _C: Any = mujoco  # a C extension without stubs
 class Frame(NamedTuple):
     """A place in the frame of a link.
 
-    link: -1 is the world
+    link: -1 is the world, -2 the first mocap body, -3 the second one
     pos: [3] (m)
     quat: [4]
     """

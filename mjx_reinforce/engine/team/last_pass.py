@@ -15,7 +15,7 @@ import numpy as np
 from mujoco import mjx
 
 from mjx_reinforce.engine.base import MjModel
-from mjx_reinforce.engine.physics import sensors
+from mjx_reinforce.engine.physics import mjx_internals, sensors
 from mjx_reinforce.engine.physics.mjx_internals import Simulation, jax_fields, with_fields
 from mjx_reinforce.engine.team import flags
 
@@ -70,7 +70,7 @@ def completed_data(
       data: ``qpos``, ``qvel``, ``qacc``, ``ctrl``, ``time`` and ``cfrc_ext`` of a forward pass.
       touch: what ``touch_sensors`` show [n] (N).
     """
-    data = mjx.kinematics(model, data)
+    data = mjx_internals.kinematics(model, data)
     data = mjx.com_pos(model, data)
     data = mjx.camlight(model, data)
     data = mjx.tendon(model, data)

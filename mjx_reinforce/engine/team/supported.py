@@ -9,7 +9,7 @@ import numpy as np
 
 from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.physics.early_stop import stops_early
-from mjx_reinforce.engine.physics.mjx_internals import geom_pairs
+from mjx_reinforce.engine.physics.mjx_internals import meeting_pairs
 from mjx_reinforce.engine.team import flags
 
 _C: Any = mujoco  # a C extension without stubs
@@ -105,7 +105,6 @@ def _lacking_parts(model: Any) -> Iterable[tuple[str, Any]]:
     yield f"more than {MAX_DOFS} degrees of freedom", model.nv > MAX_DOFS
     yield f"{_MAX_GEOMS} geoms or more", model.ngeom >= _MAX_GEOMS
     yield "flexes or plugins", model.nflex or model.nplugin
-    yield "mocap bodies", model.nmocap
     pulling = pulling_tendons(model)
     wrap_tendons = np.repeat(np.arange(model.ntendon), model.tendon_num)
     wraps = model.wrap_type[np.isin(wrap_tendons, pulling)]
@@ -210,7 +209,7 @@ def meeting(model: Any) -> list[GeomPair]:
     """Returns the pairs of geoms that may meet, the flatter first; those of C's choice lead."""
     if not flags.has_contacts(model):
         return []
-    pair_keys = ((int(pair), *sorted((int(g), int(h)))) for g, h, pair in geom_pairs(model))
+    pair_keys = ((int(pair), *sorted((int(g), int(h)))) for g, h, pair in meeting_pairs(model))
     pairs = []
     for pair, *geoms in sorted(pair_keys):
         flat_geom, round_geom = sorted(geoms, key=model.geom_type.__getitem__)

@@ -1,8 +1,8 @@
 """Tables of a model of MuJoCo, as C++ text, for the device code in which a team plays it.
 
 A link is what one joint moves; its frame is turned as the body after that joint, and its origin is
-the joint's anchor. A body without a joint belongs to the link that carries it: bodies, geoms and
-anchors have fixed places in the frames of links.
+the joint's anchor. A body without a joint belongs to the link that carries it, to the world, or to
+a mocap body: bodies, geoms and anchors have fixed places in the frames of these.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -280,8 +280,8 @@ class _Tables:
         self.reals[name] = np.hstack(rows)[order]
 
     def _link_number(self, link: int) -> int:
-        """Returns the number of a link in the state: the world is the last."""
-        return self.model.njnt if link < 0 else link
+        """Returns the number of a ``Frame.link`` in the state: the world is behind the links."""
+        return self.model.njnt - 1 - link if link < 0 else link
 
     def _links(self) -> None:
         """Makes the tables of links, and finds the frames of bodies."""
@@ -293,6 +293,8 @@ class _Tables:
         for body in range(1, model.nbody):
             parent = self.frames[model.body_parentid[body]]
             frame = parent.then(model.body_pos[body], model.body_quat[body])
+            if model.body_mocapid[body] >= 0:
+                frame = Frame(-2 - model.body_mocapid[body], np.zeros(3), identity)
             start = model.body_jntadr[body]
             # The joints of a body are a chain: each moves the frame of the next.
             for joint in range(start, start + model.body_jntnum[body]):
@@ -326,6 +328,11 @@ class _Tables:
         joints = np.flatnonzero(joint_kinds <= BALL)
         self.ints["turn_dof"] = model.jnt_dofadr[joints] + 3 * (joint_kinds[joints] == FREE)
         self.constants["NTURN"] = len(joints)
+        # Where an episode does not say otherwise.
+        mocap_bodies = np.flatnonzero(model.body_mocapid >= 0)
+        self.constants["NMOCAP"] = model.nmocap
+        self.reals["mocap_pos"] = model.body_pos[mocap_bodies]
+        self.reals["mocap_quat"] = model.body_quat[mocap_bodies]
 
     def _bodies(self) -> None:
         """Makes the tables of bodies, and of the inertias of links."""
@@ -462,7 +469,8 @@ class _Tables:
     def _chains(self, dof_kinds: np.ndarray) -> None:
         """Makes the tables of which degrees of freedom move a link, and which meet in M."""
         model = self.model
-        link_chains = [[] for _ in range(model.njnt + 1)]  # none moves the world, the last
+        # None moves the world and mocap bodies, the last.
+        link_chains = [[] for _ in range(model.njnt + 1 + model.nmocap)]
         dof_pairs = []
         for i in range(model.nv):
             chain = []
@@ -655,12 +663,12 @@ class _Tables:
         ancestors = list(self.parents)
         jumps = []
         starts = [0]
-        while any(x >= 0 for x in ancestors):
+        while any(x != -1 for x in ancestors):
             for row in range(3):
                 jumps += [
-                    records.packed(3 * link + row, 3 * ancestor + row)
+                    records.packed(3 * link + row, 3 * self._link_number(ancestor) + row)
                     for link, ancestor in enumerate(ancestors)
-                    if ancestor >= 0
+                    if ancestor != -1
                 ]
             starts.append(len(jumps))
             ancestors = [ancestors[x] if x >= 0 else -1 for x in ancestors]

@@ -343,3 +343,32 @@ def test_connects_and_welds_ask_for_what_c_asks():
     theirs = data.efc_aref[connect_first]
     np.testing.assert_allclose(found[:15], theirs, rtol=1e-10, atol=1e-10)
     assert np.abs(found[:15] - plain[:15]).max() > 1
+
+
+STILL = """
+<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 .1"/><geom name="post" size=".2"/>
+    <body mocap="true" pos="0 0 .05">
+      <geom name="tray" type="box" size=".1 .1 .1"/>
+      <body pos="0 0 .2"><joint axis="0 1 0"/><geom type="capsule" size=".06 .1"/></body>
+    </body>
+    <body mocap="true" pos=".1 0 .05"><geom type="box" size=".1 .1 .1"/></body>
+    <body pos=".1 0 .2"><freejoint/><geom size=".06"/></body>
+  </worldbody>
+  <contact><pair geom1="floor" geom2="tray"/><pair geom1="floor" geom2="post"/></contact>
+</mujoco>"""
+
+
+@pytest.mark.slow
+def test_bodies_that_nothing_moves_do_not_touch():
+    """C leaves out contacts of mocap bodies with the world and with each other."""
+    model = mujoco.MjModel.from_xml_string(STILL)  # pyright: ignore
+    data = mujoco.MjData(model)  # pyright: ignore
+    mujoco.mj_forward(model, data)  # pyright: ignore
+    is_included = data.contact.exclude == 0
+    assert not is_included.all()
+    found = contacts.fwd_position(mjx.put_model(model, impl="jax"), contacts.make_data(model, None))
+    contact = jax_fields(found).contact
+    geoms = np.asarray(contact.geom)[np.asarray(contact.dist) < 0]
+    assert {*map(tuple, geoms)} == {*map(tuple, data.contact.geom[is_included])}

@@ -1,8 +1,11 @@
 """NVIDIA's compiler takes every kind of kernel; it needs no GPU."""
 
+from typing import Any
+
 import gpu_on_cpu
 import jax
 import jax.numpy as jnp
+import mujoco
 import pytest
 from players import actor_and_act
 
@@ -11,8 +14,11 @@ from mjx_reinforce import envs
 from mjx_reinforce.engine.gpu import cubin, nvrtc
 from mjx_reinforce.engine.gpu.loops import ENTRY
 from mjx_reinforce.engine.play import native, teams
+from mjx_reinforce.envs import models
+from mjx_reinforce.envs.base import MujocoEnv
 from mjx_reinforce.envs.tasks.humanoids import Humanoid
 
+_C: Any = mujoco  # a C extension without stubs
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(nvrtc.library() is None, reason=nvrtc.version()),
@@ -26,6 +32,22 @@ class RandomHumanoid(Humanoid):
         scale = jax.random.uniform(rng, minval=0.8, maxval=1.2)
         fields = ("body_mass", "geom_friction")
         return {name: scale * jnp.asarray(getattr(self.mj_model, name)) for name in fields}
+
+
+class AntOnTray(MujocoEnv):
+    """The floor of the ant is a tray, elsewhere in each episode."""
+
+    def __init__(self):
+        spec = models.spec("ant.xml")
+        tray = spec.worldbody.add_body(name="tray", mocap=True)
+        tray.add_geom(type=_C.mjtGeom.mjGEOM_PLANE, size=[1, 1, 1])
+        super().__init__(xml_file=spec, frame_skip=5, max_episode_steps=20, reward_threshold=None)
+
+    def initial(self, rng):
+        return {"mocap_pos": 0.1 * jax.random.normal(rng, (1, 3))}
+
+    def outcome(self, before, data, action):
+        return data.body("tray").xpos[2] - data.mocap_pos[0, 2], False, {}
 
 
 @pytest.fixture
@@ -58,6 +80,7 @@ def sources(monkeypatch):
     [
         pytest.param(lambda: envs.make("Hopper-v5"), 1, id="a thread an episode"),
         pytest.param(lambda: envs.make("Ant-v5"), 16, id="16 lanes"),
+        pytest.param(AntOnTray, 16, id="16 lanes, a mocap body"),
         pytest.param(EllipticQuadruped, 32, id="32 lanes, cones"),
         pytest.param(RandomHumanoid, 32, id="32 lanes, random models"),
     ],

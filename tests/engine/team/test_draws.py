@@ -49,6 +49,8 @@ _WALKER = """
     </body>
     {lone}
     <site name="post" pos=".3 .1 .3"/>
+    <body mocap="true" pos="-.12 0 .02" euler="0 20 0"><geom size=".06"/></body>
+    <body mocap="true" pos="0 2 0"><geom size=".1" friction=".3"/></body>
   </worldbody>
   <contact><pair geom1="floor" geom2="ball" friction=".9 .7 .02 .01 .01" condim="4"/></contact>
   <tendon>

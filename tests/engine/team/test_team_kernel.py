@@ -41,6 +41,19 @@ LEG = """
 </mujoco>"""
 
 
+HAND = """
+    <body name="hand" mocap="true" pos=".16 0 .2" euler="10 20 0">
+      <geom size=".1"/><body pos="0 0 .02"><site name="goal" pos=".01 .02 .05" size=".2"/></body>
+    </body>
+  </worldbody>
+  <tendon>
+    <spatial stiffness="20" springlength=".1"><site site="goal"/><site site="foot"/></spatial>
+  </tendon>
+  <sensor>
+    <touch site="goal"/><framepos objtype="site" objname="foot" reftype="site" refname="goal"/>
+  </sensor>"""
+
+
 class Leg(MujocoEnv):
     """It observes what its sensors show, in parts of what they show at most."""
 
@@ -69,6 +82,35 @@ class RandomLeg(Leg):
 
     def observe(self, data):
         return jnp.concatenate([super().observe(data), data.episode["body_mass"]])
+
+
+class HeldLeg(MujocoEnv):
+    """It hangs by a tendon from a mocap body that it hits, and observes where that is."""
+
+    def initial(self, rng):
+        qvel = 0.3 * jax.random.normal(rng, (2,))
+        return {"qpos": jnp.array([-0.01, 0.1]), "qvel": qvel}
+
+    def observe(self, data):
+        goal = data.site("goal")
+        seen = [data.qpos, jnp.tanh(data.qvel), jnp.tanh(data.sensordata), goal.xpos]
+        return jnp.concatenate([*seen, goal.xmat.ravel(), data.body("hand").xpos])
+
+    def outcome(self, before, data, action):
+        return data.mocap_pos[0, 2] + before.mocap_quat[0, 1], False, {}
+
+
+class MovedLeg(HeldLeg):
+    """The mocap body is elsewhere in each episode."""
+
+    def initial(self, rng):
+        key, rng = jax.random.split(rng)
+        noise = jax.random.normal(key, (7,))
+        poses = {
+            "mocap_pos": jnp.array([[0.16, 0, 0.2]]) + 0.03 * noise[:3],
+            "mocap_quat": jnp.array([[2.0, 0, 0, 0]]) + 0.5 * noise[3:],
+        }
+        return super().initial(rng) | poses
 
 
 class RememberingLeg(Leg):
@@ -167,6 +209,25 @@ def test_teams_play_models_that_differ_from_episode_to_episode(teams):
     for name in ("observation", "reward"):
         pair = (getattr(x, name)[:, :20] for x in (got, want))
         np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", [HeldLeg, MovedLeg])
+def test_teams_play_mocap_bodies(teams, task):
+    spec = mujoco.MjSpec.from_string(LEG.replace("</worldbody>", HAND))
+    env = task(xml_file=spec, frame_skip=2, max_episode_steps=30, reward_threshold=None)
+    actor, act, distribution = player = actor_and_act(env, (5,))
+    policy = choice.ActingPolicy(act, actor, distribution)
+    want = played(choice.choose("mujoco", env, policy, 30).rollout, env, player, num_seeds=2)
+    made = teams()
+    got = played(native.native_rollout, env, player, num_seeds=2)
+    assert [kernel.launch.lanes for kernel in made] == [16, 16]
+    for name in ("observation", "action", "reward"):
+        pair = (getattr(x, name)[:, :20] for x in (got, want))
+        np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
+    assert (want.observation[..., 10] > 0).any()  # the mocap body is touched
+    heights = want.reward[:, 0].ravel()
+    assert len(np.unique(heights)) == (heights.size if task is MovedLeg else 1)
 
 
 @pytest.mark.slow

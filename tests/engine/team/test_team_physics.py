@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import mujoco
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ needs_compiler = pytest.mark.skipif(device_code.COMPILER is None, reason="there 
 _OWN = str(Path(__file__).parents[3] / "experiments" / "examples" / "quadruped")
 _MODELS = tomllib.loads((Path(__file__).parent / "models.toml").read_text("utf-8"))
 _QUICK = ("limits", "condim 6 and 4", "elliptic cones, condim 1 and 3", "boxes on boxes", "3 steps")
+_OF_MOCAP = [x for x in _MODELS["features"] if "mocap" in x]
 _MANY = '<geom size=".1"/>'
 _TWO = """
 <mujoco>
@@ -88,7 +90,7 @@ def _error(m: Any, play: Any, data: Any, skip: int) -> float:
     """Plays an env step here and in C; returns the largest error, relative where above 1."""
     is_touch = m.sensor_type == _C.mjtSensor.mjSENS_TOUCH
     mine = {name: getattr(data, name).copy() for name in device_code.STATE}
-    mine |= play(mine, data.ctrl, skip)
+    mine |= play(mine, data.ctrl, skip, _numbers(m, data))
     theirs = {}
     for _ in range(skip):
         theirs |= {f"pass_{name}": getattr(data, name).copy() for name in ("qpos", "qvel")}
@@ -98,6 +100,8 @@ def _error(m: Any, play: Any, data: Any, skip: int) -> float:
     if m.opt.integrator == _C.mjtIntegrator.mjINT_RK4:  # of its last stage C keeps the poses
         last = _C.MjData(m)
         last.qpos[:] = mine["pass_qpos"]
+        last.mocap_pos[:] = data.mocap_pos
+        last.mocap_quat[:] = data.mocap_quat
         _C.mj_kinematics(m, last)
         mine = {name: x for name, x in mine.items() if name not in theirs}
         mine |= {"xquat": last.xquat.ravel(), "site_xpos": last.site_xpos.ravel()}
@@ -108,6 +112,13 @@ def _error(m: Any, play: Any, data: Any, skip: int) -> float:
     return max(errors)
 
 
+def _numbers(m: Any, data: Any) -> np.ndarray:
+    """Returns what the device code reads of the poses of mocap bodies."""
+    with jax.enable_x64(True):
+        poses = {name: getattr(data, name) for name in ("mocap_pos", "mocap_quat")}
+        return np.array(tables.drawn_numbers(m, (), poses))
+
+
 def _largest_error(m: Any, folder: Any, skip: int, starts: int, near=tables.NUM_NEAR, lanes=1):
     """Returns the largest error of steps along short episodes of random play."""
     play = _compiled(m, folder, near, lanes)
@@ -115,6 +126,8 @@ def _largest_error(m: Any, folder: Any, skip: int, starts: int, near=tables.NUM_
     for _ in range(starts):
         data = _C.MjData(m)
         data.qvel[:] = 0.3 * rng.normal(size=m.nv)
+        data.mocap_pos += 0.02 * rng.normal(size=(m.nmocap, 3))
+        data.mocap_quat += 0.2 * rng.normal(size=(m.nmocap, 4))  # not of length 1
         for _ in range(10):
             data.ctrl[:] = rng.uniform(-1, 1, m.nu)
             errors.append(_error(m, play, data, skip))
@@ -186,11 +199,12 @@ def test_a_search_that_stops_early_ends_where_c_ends(limits, tmp_path):
         "spatial tendons",
         "limits and friction loss of tendons",
         "a tendon between two trees, implicitfast",
+        *_OF_MOCAP,
     ],
 )
-def test_lanes_share_cables(feature, lanes, tmp_path):
+def test_lanes_share_cables_and_mocap_bodies(feature, lanes, tmp_path):
     m = _model(**_MODELS["features"][feature])
-    assert _largest_error(m, tmp_path, skip=3, starts=1, lanes=lanes) < 1e-9
+    assert _largest_error(_exact(m), tmp_path, skip=3, starts=1, lanes=lanes) < 1e-9
 
 
 @needs_compiler

@@ -27,7 +27,7 @@ DEV void connect_rows(const Team& t, const Model& M, State& s, int n) {
     real residual = 0;
     for (int side = 0; side < 2; side++) {
       const int l = link[side];
-      if (l == NL) continue;
+      if (l >= NL) continue;
       const real *v = s.velocity[l], *x = s.motion[l];
       const real* a = &s.subtree[l][2].x[0] + 2;  // the acceleration that qvel brings
       real speed[3], turned[3], by_qvel[3], by_x[3];

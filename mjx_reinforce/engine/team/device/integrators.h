@@ -134,9 +134,7 @@ DEV void euler(const Team& t, const Model& M, State& s, bool last) {
 // mj_checkVel, mj_checkAcc).
 DEV bool physics(const Team& t, const Model& M, State& s, int skip) {
   const int lane = t.lane;
-  EACH(k, 12) s.pose[NL].row[k / 4].x[k % 4] = k % 5 == 0;
-  EACH(k, 6) s.velocity[NL][k] = s.motion[NL][k] = 0;
-  t.sync();
+  place_fixed(t, M, s);
   bool sound = true;
   LOOP for (int n = 0; n < skip; n++) {
     if (RK4) {
@@ -159,9 +157,7 @@ DEV bool physics(const Team& t, const Model& M, State& s, int skip) {
 // mj_forward, which leaves cfrc_ext zero where no sensor needs it.
 DEV void start(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
-  EACH(k, 12) s.pose[NL].row[k / 4].x[k % 4] = k % 5 == 0;
-  EACH(k, 6) s.velocity[NL][k] = s.motion[NL][k] = 0;
-  t.sync();
+  place_fixed(t, M, s);
   forward(t, M, s);
   report(t, M, s);
   if (reports(CFRC_EXT) && !SENSES_FORCES) EACH(n, 6 * NB) s.cfrc_ext[n] = 0;

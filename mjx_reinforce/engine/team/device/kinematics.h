@@ -1,6 +1,6 @@
 // Where everything is (MuJoCo's mj_kinematics and mj_comPos). A link is what one joint moves: a
-// body of several joints is a chain of links, a body without a joint belongs to the link that
-// carries it.
+// body of several joints is a chain of links, a body without a joint belongs to the link, the world
+// or the mocap body that carries it.
 #pragma once
 
 enum { FREE, BALL, SLIDE, HINGE };              // joints
@@ -36,6 +36,22 @@ DEV Pose pose_in_parent(const Model& M, const State& s, int l) {
     }
   }
   return pose_of(turn, at);
+}
+
+// The world and mocap bodies, which do not move during an episode.
+DEV void place_fixed(const Team& t, const Model& M, State& s) {
+  const int lane = t.lane;
+  EACH(k, 12) s.pose[NL].row[k / 4].x[k % 4] = k % 5 == 0;
+  EACH(k, 6) s.velocity[NL][k] = s.motion[NL][k] = 0;
+  EACH(m, NMOCAP) {
+    const int link = NL + 1 + m;
+    real quat[4];
+    for (int k = 0; k < 4; k++) quat[k] = M.mocap_quat[4 * m + k];
+    to_unit(quat);
+    s.pose[link] = pose_of(quat, M.mocap_pos + 3 * m);
+    for (int k = 0; k < 6; k++) s.velocity[link][k] = s.motion[link][k] = 0;
+  }
+  t.sync();
 }
 
 // Poses in the world: each round doubles the number of ancestors that a pose has been joined with.

@@ -63,7 +63,8 @@ DEV void external_forces(const Team& t, const Model& M, State& s) {
   }
 }
 
-// The center of mass of the tree of a body (MuJoCo's subtree_com of the root).
+// The center of mass of the tree of a body (MuJoCo's subtree_com of the root), or of the root where
+// nothing has mass.
 DEV void center_of_tree(const Model& M, const State& s, int body, real* com) {
   real total = 0;
   for (int k = 0; k < 3; k++) com[k] = 0;
@@ -72,7 +73,8 @@ DEV void center_of_tree(const Model& M, const State& s, int body, real* com) {
     total += M.body_mass[b];
     for (int k = 0; k < 3; k++) com[k] += M.body_mass[b] * s.xipos[3 * b + k];
   }
-  for (int k = 0; k < 3; k++) com[k] = total > 0 ? com[k] / total : real(0);
+  const real* root = s.xipos + 3 * M.body_root[body];
+  for (int k = 0; k < 3; k++) com[k] = total > 0 ? com[k] / total : root[k];
 }
 
 // Positions and spatial quantities of bodies (mj_comPos, mj_comVel).

@@ -76,10 +76,10 @@ struct alignas(4 * sizeof(real)) State : Drawn {
   real qpos[padded(NQ)], qvel[padded(NV)], qacc_warmstart[padded(NV)];
   real qfrc_actuator[padded(NV)], ctrl[padded(NU)], act[1], time[1];
   Quad cdof[NV][2];
-  Pose pose[NL + 1];        // of links; the last is the world
+  Pose pose[NL + 1 + NMOCAP];  // of links, then of the world, then of mocap bodies
   Quad direction[QUADS];    // of a Newton step
-  real velocity[NL + 1][6]; // of links, by qvel
-  real motion[NL + 1][6];   // of links, by an acceleration or by a step of it
+  real velocity[NL + 1 + NMOCAP][6];  // of these, by qvel
+  real motion[NL + 1 + NMOCAP][6];    // of these, by an acceleration or by a step of it
   real imbalance[NV];       // M qacc - qfrc_smooth
   real drag[IMPLICIT ? NV : 1];  // what damps implicitly
   real start_qpos[RK4 ? NQ : 1], start_qvel[RK4 ? NV : 1];
