@@ -14,10 +14,9 @@ from jax.typing import ArrayLike
 
 from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.checks import require
+from mjx_reinforce.envs.mending.ground import first_pose, stance
 
 _C: Any = mujoco  # a C extension without stubs
-#: A geom is a foot if it is at most so much higher than the lowest geom of all limbs (m).
-_ABOVE_LOWEST = 0.05
 #: Steps of Newton's method on the place of a foot, and the damping of its least squares.
 _ITERATIONS = 20
 _DAMPING = 1e-4
@@ -39,30 +38,25 @@ class Foot(NamedTuple):
 def feet(model: MjModel) -> list[Foot]:
     """Returns the feet in their order around the robot, from behind on, seen from above.
 
-    A foot is the lowest geom of a limb that may touch something, in the first key frame, or in the
-    model's pose where there is none. Limbs are told apart by their first joint.
+    They are the geoms that come nearest the floor in the first key frame, or in the model's pose
+    where there is none; of each limb, which its first joint tells from others, one.
     """
-    data = _first_pose(model)
-    may_touch = (np.asarray(model.geom_contype) | np.asarray(model.geom_conaffinity)) != 0
-    may_touch[[*model.pair_geom1, *model.pair_geom2]] = True
-    lowest: dict[int, tuple[float, Foot]] = {}
-    for geom in np.flatnonzero(may_touch):
+    standing = stance(model)
+    if standing is None:
+        return []
+    data = first_pose(model)
+    limbs: dict[int, Foot] = {}
+    for geom in standing.feet:
         joints = _joints_to(model, model.geom_bodyid[geom])
-        if not joints:
-            continue
-        position = data.geom_xpos[geom].copy()
-        height = position[2] - model.geom_rbound[geom]
-        if joints[0] not in lowest or height < lowest[joints[0]][0]:
-            lowest[joints[0]] = height, Foot(int(geom), joints, position)
-    floor = min((height for height, _ in lowest.values()), default=0.0)
-    standing = [foot for height, foot in lowest.values() if height < floor + _ABOVE_LOWEST]
-    middle = np.mean([foot.position for foot in standing], axis=0) if standing else 0.0
+        if joints:
+            limbs.setdefault(joints[0], Foot(geom, joints, data.geom_xpos[geom].copy()))
+    middle = np.mean([foot.position for foot in limbs.values()] or np.zeros((1, 3)), axis=0)
 
     def direction(foot: Foot) -> float:
         x, y, _ = foot.position - middle
         return float(np.arctan2(y, x))
 
-    return sorted(standing, key=direction)
+    return sorted(limbs.values(), key=direction)
 
 
 def gait(model: MjModel, height: float, num_steps: int) -> np.ndarray:
@@ -82,8 +76,8 @@ def gait(model: MjModel, height: float, num_steps: int) -> np.ndarray:
     standing = feet(model)
     require(
         len(standing) > 1,
-        f"a gait needs two feet or more, and this model has {len(standing)}: geoms at the ends of "
-        "limbs that may touch the floor, lowest in the first key frame",
+        f"a gait needs two feet or more, and this model has {len(standing)}: geoms of limbs that "
+        "may touch a floor, and come nearest to it in the first key frame",
     )
     addresses = model.jnt_qposadr[model.actuator_trnid[:, 0]]
     lifts = np.stack([_lift(model, foot, height)[addresses] for foot in standing])
@@ -108,16 +102,6 @@ def clock(step: ArrayLike, num_steps: int) -> jax.Array:
     return jnp.stack([jnp.sin(angle), jnp.cos(angle)])
 
 
-def _first_pose(model: MjModel) -> Any:
-    """Returns an ``MjData`` in the first key frame, or in the model's pose."""
-    data = _C.MjData(model)
-    if model.nkey:
-        data.qpos[:] = model.key_qpos[0]
-    _C.mj_kinematics(model, data)
-    _C.mj_comPos(model, data)
-    return data
-
-
 def _joints_to(model: MjModel, body: int) -> tuple[int, ...]:
     """Returns the hinges and slides between the root and a body, the root's side first."""
     joints: list[int] = []
@@ -131,15 +115,17 @@ def _joints_to(model: MjModel, body: int) -> tuple[int, ...]:
 
 def _lift(model: MjModel, foot: Foot, height: float) -> np.ndarray:
     """Returns the change of qpos [nq] that lifts a foot straight up: damped least squares."""
-    data = _first_pose(model)
+    data = first_pose(model)
+    _C.mj_comPos(model, data)
     pose = data.qpos.copy()
     body = model.geom_bodyid[foot.geom]
     dofs = model.jnt_dofadr[list(foot.joints)]
     addresses = model.jnt_qposadr[list(foot.joints)]
+    goal = np.add(foot.position, [0.0, 0.0, height])
     jacobian = np.zeros((3, model.nv))
     for _ in range(_ITERATIONS):
         position = data.geom_xpos[foot.geom]
-        way = foot.position + [0.0, 0.0, height] - position
+        way = goal - position
         _C.mj_jac(model, data, jacobian, None, position, body)
         columns = jacobian[:, dofs]
         square = columns @ columns.T + _DAMPING * np.eye(3)
