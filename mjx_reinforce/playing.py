@@ -1,7 +1,8 @@
 """Single episodes of a trained policy: in our simulation, and in C MuJoCo, which starts at once."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -25,15 +26,15 @@ class Episode(NamedTuple):
     qpos: [L, nq] generalized positions (m, rad), the start's first
     rewards: [T], nan in a step that left the finite numbers
     terms: [T] each, terms of the reward by name; none where it has fewer than two
-    commands: [L, K] the entry "command" of the memory, or of the episode; without one K is 0
-    pushes: [T] whether C MuJoCo began the step with a push; our simulation does not say
+    commands: [L, K] the entry "command" of the memory, or of the episode; None without one
+    pushes: [T] whether C MuJoCo began the step with a push; None of our simulation
     """
 
     qpos: np.ndarray
     rewards: np.ndarray
-    terms: dict[str, np.ndarray]
-    commands: np.ndarray
-    pushes: np.ndarray
+    terms: Mapping[str, np.ndarray] = MappingProxyType({})
+    commands: np.ndarray | None = None
+    pushes: np.ndarray | None = None
 
     @property
     def total(self) -> float:
@@ -107,7 +108,7 @@ def simulator(env: "Environment", player: Player, horizon: int) -> Simulator:
             for x, later in zip(start, poses, strict=True)
         )
         terms = {name: terms[name][mask] for name in names}
-        return Episode(qpos, rewards, terms, commands, np.zeros(len(rewards), bool))
+        return Episode(qpos, rewards, terms, commands if commands.size else None)
 
     return play
 
@@ -149,7 +150,11 @@ def mujoco_simulator(env: "Environment", player: Player, horizon: int) -> Simula
             commands.append(simulation.command)
         columns = dict(zip(names, np.array(terms).T, strict=True))
         return Episode(
-            np.stack(qpos), np.array(rewards), columns, np.stack(commands), np.array(pushes)
+            qpos=np.stack(qpos),
+            rewards=np.array(rewards),
+            terms=columns,
+            commands=np.stack(commands) if simulation.command.size else None,
+            pushes=np.array(pushes),
         )
 
     return play

@@ -269,15 +269,18 @@ _TERM_PREFIXES = ("reward_", "reward/")
 def term_names(env: Environment) -> tuple[str, ...]:
     """Returns the names of the reward's terms, in the order of the task; none of a single one.
 
-    They are those ``metrics`` of the state, of brax's interface, that begin with "reward_" or
-    "reward/". One term alone would be the reward again.
+    They are the numbers [] among the ``metrics`` of the state, of brax's interface, that begin with
+    "reward_" or "reward/". One term alone would be the reward again.
     """
     names: list[str] = []
 
     def reset(rng: jax.Array) -> Any:
         state = env.reset(rng)
         # JAX sorts the names in what a function returns: the order is seen here alone.
-        names[:] = [x for x in getattr(state, "metrics", {}) if x.startswith(_TERM_PREFIXES)]
+        metrics = getattr(state, "metrics", None)
+        if isinstance(metrics, dict):  # what a state of the user's own calls so may be anything
+            terms = {x: y for x, y in metrics.items() if str(x).startswith(_TERM_PREFIXES)}
+            names[:] = [x for x, term in terms.items() if getattr(term, "shape", None) == ()]
         return state
 
     shapes(reset, jax.random.key(0))

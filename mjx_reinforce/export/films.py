@@ -5,6 +5,7 @@ import io
 import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -65,9 +66,9 @@ class Take(NamedTuple):
     qpos: [L, nq] generalized positions (m, rad), the start's first
     rewards: [T] of each env step
     terms: [T] each, terms of the reward by name; none where it has fewer than two
-    commands: [L, K] what the robot is to do at each of the positions; without a command K is 0.
-      Three numbers are a velocity in the robot's frame: forward, sideways (m/s), turning (rad/s)
-    pushes: [T] whether an env step began with a push
+    commands: [L, K] what the robot is to do at each of the positions, if that is known. Three
+      numbers are a velocity in the robot's frame: forward, sideways (m/s), turning (rad/s)
+    pushes: [T] whether an env step began with a push, if that is known
     """
 
     label: str
@@ -75,9 +76,9 @@ class Take(NamedTuple):
     dt: float
     qpos: np.ndarray
     rewards: np.ndarray
-    terms: Mapping[str, np.ndarray]
-    commands: np.ndarray
-    pushes: np.ndarray
+    terms: Mapping[str, np.ndarray] = MappingProxyType({})
+    commands: np.ndarray | None = None
+    pushes: np.ndarray | None = None
 
 
 class Film(NamedTuple):
@@ -141,31 +142,36 @@ def _picture(take: Take, renderer: Renderer, seconds: float) -> np.ndarray:
     """Returns a take's picture at a time (s)."""
     # A take that ended keeps its last position.
     step = min(int(seconds / take.dt + 1e-6), len(take.qpos) - 1)
-    command = take.commands[step]
-    arrows = []
-    strips = []
-    if command.size:
-        strips = [("command " + ", ".join(map(_short, command)), "")]
-    if command.size == 3 and (paths := robot_paths(take)) is not None:
-        speeds = velocities(take, paths)[step]
-        heading = paths[step, 2]
-        arrows = [
-            Arrow(_in_world(speeds, heading), _ROBOT_INK),
-            Arrow(_in_world(command, heading), _COMMAND_INK),
-        ]
-        forward, sideways, turning = map(_short, command)
-        words = f"command {forward} m/s, {sideways} m/s, {turning} rad/s"
-        strips = [(words, "robot " + ", ".join(map(_short, speeds)))]
+    arrows, strips = _command_shown(take, step)
     picture = renderer.draw(take.qpos[step], arrows)
     total_reward = np.sum(take.rewards[:step])
     digits = 0 if abs(total_reward) >= 100 else 1
     note = f"return {total_reward:,.{digits}f}   {step * take.dt:4.1f} s"
-    if take.pushes[max(0, step - round(_PUSH_SECONDS / take.dt)) : step].any():
+    first = max(0, step - round(_PUSH_SECONDS / take.dt))
+    if take.pushes is not None and take.pushes[first:step].any():
         note = f"pushed   {note}"
     picture = caption(picture, take.label, note)
     for words in strips:
         picture = caption(picture, *words, inks=(_COMMAND_INK, _ROBOT_INK))
     return picture
+
+
+def _command_shown(take: Take, step: int) -> tuple[list[Arrow], list[tuple[str, str]]]:
+    """Returns the arrows of a command and of what the robot does, and the words of a strip."""
+    if take.commands is None:
+        return [], []
+    command = take.commands[step]
+    if command.size != 3 or (paths := robot_paths(take)) is None:
+        return [], [("command " + ", ".join(map(_short, command)), "")]
+    speeds = velocities(take, paths)[step]
+    heading = paths[step, 2]
+    forward, sideways, turning = map(_short, command)
+    words = f"command {forward} m/s, {sideways} m/s, {turning} rad/s"
+    arrows = [
+        Arrow(_in_world(speeds, heading), _ROBOT_INK),
+        Arrow(_in_world(command, heading), _COMMAND_INK),
+    ]
+    return arrows, [(words, "robot " + ", ".join(map(_short, speeds)))]
 
 
 def robot_paths(take: Take) -> np.ndarray | None:

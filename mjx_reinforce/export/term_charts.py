@@ -19,17 +19,18 @@ def draw_terms(take: Take) -> bytes:
     """
     from matplotlib.figure import Figure
 
-    num_panels = 1 + (take.commands.shape[1] > 0)
+    num_panels = 1 if take.commands is None else 2
     figure = Figure(figsize=(8, 3 * num_panels), dpi=150, layout="constrained")
     panels = np.ravel(figure.subplots(num_panels, sharex=True, squeeze=False))
     seconds = take.dt * np.arange(1, 1 + len(take.rewards))
     for name, rewards in (take.terms or {"reward": take.rewards}).items():
         panels[0].plot(seconds, rewards, linewidth=1, label=name)
     panels[0].set(title=take.label, ylabel="reward of an env step")
-    if num_panels > 1:
-        _draw_command(panels[1], take)
+    if take.commands is not None:
+        _draw_command(panels[1], take, take.commands)
+    push_steps = [] if take.pushes is None else np.flatnonzero(take.pushes)
     for panel in panels:
-        for pushed in seconds[take.pushes] - take.dt:  # an env step begins with a push
+        for pushed in take.dt * np.asarray(push_steps):  # an env step begins with a push
             panel.axvline(pushed, color="0.6", linewidth=0.8)
         panel.grid(alpha=0.3)
         panel.legend(frameon=False, fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5))
@@ -39,12 +40,12 @@ def draw_terms(take: Take) -> bytes:
     return file.getvalue()
 
 
-def _draw_command(panel: Any, take: Take) -> None:
+def _draw_command(panel: Any, take: Take, commands: np.ndarray) -> None:
     """Draws each number of the command, and what the robot does of it in the same color."""
     seconds = take.dt * np.arange(len(take.qpos))
     paths = robot_paths(take)
-    is_velocity = take.commands.shape[1] == len(_VELOCITY) and paths is not None
-    for number, command in enumerate(take.commands.T):
+    is_velocity = commands.shape[1] == len(_VELOCITY) and paths is not None
+    for number, command in enumerate(commands.T):
         label = _VELOCITY[number] if is_velocity else f"command {number}"
         look = {"color": f"C{number}", "linewidth": 1.2, "label": label}
         panel.plot(seconds, command, "--", drawstyle="steps-post", **look)

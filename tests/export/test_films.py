@@ -142,12 +142,10 @@ class Flat:
         return np.full(self.shape, qpos[0], np.uint8)
 
 
-def make_take(label, model, dt, qpos, commands=None, pushes=None, terms=None):
+def make_take(label, model, dt, qpos, commands=None, pushes=None):
     """Returns a take whose rewards are 1."""
-    steps = len(qpos) - 1
-    commands = np.zeros((len(qpos), 0)) if commands is None else commands
-    pushes = np.zeros(steps, bool) if pushes is None else pushes
-    return films.Take(label, model, dt, qpos, np.ones(steps), terms or {}, commands, pushes)
+    rewards = np.ones(len(qpos) - 1)
+    return films.Take(label, model, dt, qpos, rewards, commands=commands, pushes=pushes)
 
 
 def test_takes_stand_side_by_side(monkeypatch):

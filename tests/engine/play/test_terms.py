@@ -2,10 +2,11 @@
 
 import gpu_on_cpu
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from players import actor_and_act, assert_same_episodes, both, played
-from toys import Drifting, Paid
+from toys import Drifting, Paid, PaidState
 
 from mjx_reinforce import envs
 from mjx_reinforce.engine.base import term_names
@@ -67,3 +68,22 @@ def test_a_single_term_is_the_reward_and_not_recorded():
     assert term_names(env) == term_names(Drifting()) == ()
     got, want = both(env, actor_and_act(env, ()), horizon=10)
     assert got.terms == want.terms == {}
+
+
+@pytest.mark.parametrize(
+    "metrics",
+    [
+        None,
+        jnp.zeros(2),
+        {0: jnp.zeros(()), 1: jnp.zeros(())},
+        {"reward_a": jnp.zeros(()), "reward_b": jnp.zeros(3)},
+        {"reward_a": {"inner": jnp.zeros(())}, "reward_b": jnp.zeros(())},
+    ],
+)
+def test_metrics_of_another_kind_are_no_terms(metrics):
+    class Own(Drifting):
+        def reset(self, rng):
+            state = super().reset(rng)
+            return PaidState(state.obs, state.reward, state.done, state.info, metrics)
+
+    assert term_names(Own()) == ()
