@@ -275,6 +275,7 @@ def term_names(env: Environment) -> tuple[str, ...]:
     names: list[str] = []
 
     def reset(rng: jax.Array) -> Any:
+        """Resets the environment, and keeps the names."""
         state = env.reset(rng)
         # JAX sorts the names in what a function returns: the order is seen here alone.
         metrics = getattr(state, "metrics", None)
