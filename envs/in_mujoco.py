@@ -39,6 +39,8 @@ class InMujoco:
     which contacts amplify, and by what C's solver leaves where it stops before the optimum.
 
     data: the simulation, an ``MjData``; forces in ``data.xfrc_applied`` act in the next step
+    terms: what ``outcome`` returned last as the terms of the reward
+    is_pushed: whether the last env step began with a push
     """
 
     def __init__(self, env: Environment):
@@ -67,6 +69,8 @@ class InMujoco:
         self._names = sorted(recorder.names)
         self._recollection = NOTHING
         self._observation: Any = None  # what the policy saw
+        self.terms: dict[str, float] = {}
+        self.is_pushed = False
         self._split = jax.jit(env.split_rng)
         self._start = jax.jit(env.draw)
         self._observe = jax.jit(self._first_observation)
@@ -109,10 +113,11 @@ class InMujoco:
         if self.env.has_pushes:
             push = check_push(name, self.env.push(before_view), self.model.nv)
             self.data.qvel[:] += np.asarray(push)
+            self.is_pushed = bool(np.any(push))
         _C.mj_step(self.model, self.data, self.env.frame_skip)
         if self.env.contact_forces:
             _C.mj_rnePostConstraint(self.model, self.data)
-        self._observation, reward, terminated, self._recollection = self._advance(
+        self._observation, reward, terminated, self._recollection, terms = self._advance(
             before,
             self._fields(),
             self._episode,
@@ -120,10 +125,16 @@ class InMujoco:
             self._observation,
             np.asarray(action),
         )
+        self.terms = {name: float(term) for name, term in terms.items()}
         # The task would pay for where MuJoCo has put the body back.
         if was_reset(self.data):
             reward = np.nan
         return np.asarray(self._observation), float(reward), bool(terminated)
+
+    @property
+    def command(self) -> np.ndarray:
+        """The numbers [K] of the entry "command" of the memory, or of the episode; else K is 0."""
+        return np.ravel((self._episode | self._recollection.memory).get("command", ()))
 
     def _first_observation(self, memory_rng, fields, episode):
         data = self._view(fields, episode)
@@ -134,8 +145,9 @@ class InMujoco:
         data = self._view(fields, episode)
         next_recollection = recollect_step(self.env, recollection, data, action)
         before = self._view(before, episode, recollection)
-        reward, terminated, _ = self.env.outcome(before, data, action)
-        return observed(self.env, data, last_frames), reward, terminated, next_recollection
+        reward, terminated, terms = self.env.outcome(before, data, action)
+        observation = observed(self.env, data, last_frames)
+        return observation, reward, terminated, next_recollection, terms
 
     def _view(
         self,

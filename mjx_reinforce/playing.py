@@ -1,13 +1,15 @@
 """Single episodes of a trained policy: in our simulation, and in C MuJoCo, which starts at once."""
 
 import functools
-from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_reinforce.engine.base import term_names
 from mjx_reinforce.engine.episode import begin, hold, step
 from mjx_reinforce.engine.play.choice import environment_of
 from mjx_reinforce.envs.in_mujoco import InMujoco
@@ -23,10 +25,16 @@ class Episode(NamedTuple):
 
     qpos: [L, nq] generalized positions (m, rad), the start's first
     rewards: [T], nan in a step that left the finite numbers
+    terms: [T] each, terms of the reward by name; none where it has fewer than two
+    commands: [L, K] the entry "command" of the memory, or of the episode; None without one
+    pushes: [T] whether C MuJoCo began the step with a push; None of our simulation
     """
 
     qpos: np.ndarray
     rewards: np.ndarray
+    terms: Mapping[str, np.ndarray] = MappingProxyType({})
+    commands: np.ndarray | None = None
+    pushes: np.ndarray | None = None
 
     @property
     def total(self) -> float:
@@ -58,13 +66,14 @@ def simulator(env: "Environment", player: Player, horizon: int) -> Simulator:
 
     # Training draws actions as they come; a policy that is ready plays within the bounds.
     distribution = unclipped._replace(sample=sample)
+    names = term_names(env)
     play_step = functools.partial(
-        step, env.step, functools.partial(act, player.policy), distribution
+        step, env.step, functools.partial(act, player.policy), distribution, terms=names
     )
 
     @jax.jit
     def play_episode(actor, key, episode, deterministic):
-        """Returns ``qpos`` [nq] of the start, and of T steps ``qpos``, rewards and a mask."""
+        """Returns ``qpos`` and command of the start; of T steps these, rewards, terms, a mask."""
 
         def advance(carry, noise):
             """Plays a step; behind the episode's end the state stays as it was."""
@@ -74,28 +83,32 @@ def simulator(env: "Environment", player: Player, horizon: int) -> Simulator:
             # A step out of the finite numbers ends the episode, and its reward is none.
             reward = jnp.where(played_step.broken, jnp.nan, played_step.reward)
             return (next_state, played_step.alive), (
-                next_state.pipeline_state.qpos,
+                (next_state.pipeline_state.qpos, _command(next_state)),
                 reward,
+                played_step.terms,
                 is_alive,
             )
 
         start, noise_key = begin(env, jax.random.fold_in(key, episode))
         noises = distribution.noise(noise_key, (horizon,))
         _, steps = jax.lax.scan(advance, (start, jnp.array(True)), noises)
-        return start.pipeline_state.qpos, steps
+        return (start.pipeline_state.qpos, _command(start)), steps
 
     def play(episode: int, noise: bool) -> Episode:
         """Plays the episode of a number, from this function's one compiled program."""
         number = jnp.asarray(episode)
         deterministic = jnp.asarray(not noise)
         played = play_episode(player.actor, jax.random.key(0), number, deterministic)
-        start_qpos, (qpos, rewards, mask) = jax.device_get(played)
+        start, (poses, rewards, terms, mask) = jax.device_get(played)
         rewards = rewards[mask]
-        qpos = qpos[mask]
         # The last pose of a broken episode cannot be drawn.
-        if np.isnan(rewards[-1]):
-            qpos = qpos[:-1]
-        return Episode(np.concatenate([start_qpos[None], qpos]), rewards)
+        num_poses = len(rewards) - int(np.isnan(rewards[-1]))
+        qpos, commands = (
+            np.concatenate([x[None], later[mask][:num_poses]])
+            for x, later in zip(start, poses, strict=True)
+        )
+        terms = {name: terms[name][mask] for name in names}
+        return Episode(qpos, rewards, terms, commands if commands.size else None)
 
     return play
 
@@ -112,6 +125,7 @@ def mujoco_simulator(env: "Environment", player: Player, horizon: int) -> Simula
       ValueError: C MuJoCo cannot play the task, see ``InMujoco``.
     """
     simulation = InMujoco(env)
+    names = term_names(env)
 
     def play(episode: int, noise: bool) -> Episode:
         """Plays the episode of a number, from the start that it has in our simulation, too."""
@@ -120,19 +134,37 @@ def mujoco_simulator(env: "Environment", player: Player, horizon: int) -> Simula
         has_ended = False
         # Copies: MuJoCo writes every step into the same array.
         qpos = [simulation.data.qpos.copy()]
-        rewards = []
+        commands = [simulation.command]
+        rewards, terms, pushes = [], [], []
         while not has_ended and len(rewards) < horizon:
             observation, reward, has_ended = simulation.step(
                 np.asarray(player.act(observation, rng))
             )
+            terms.append([simulation.terms[name] for name in names])
+            pushes.append(simulation.is_pushed)
             if not (np.isfinite(observation).all() and np.isfinite(reward)):
                 rewards.append(np.nan)
                 break
             rewards.append(reward)
             qpos.append(simulation.data.qpos.copy())
-        return Episode(np.stack(qpos), np.array(rewards))
+            commands.append(simulation.command)
+        columns = dict(zip(names, np.array(terms).T, strict=True))
+        return Episode(
+            qpos=np.stack(qpos),
+            rewards=np.array(rewards),
+            terms=columns,
+            commands=np.stack(commands) if simulation.command.size else None,
+            pushes=np.array(pushes),
+        )
 
     return play
+
+
+def _command(state: Any) -> jax.Array:
+    """Returns the numbers [K] of the entry "command", as ``InMujoco.command``."""
+    physics = state.pipeline_state
+    entries = getattr(physics, "episode", {}) | getattr(physics, "memory", {})
+    return jnp.ravel(jnp.asarray(entries.get("command", ()), float))
 
 
 @jax.jit

@@ -16,6 +16,7 @@ from mjx_reinforce.engine.checks import explain
 from mjx_reinforce.engine.vector.pictures import check_drawing
 from mjx_reinforce.export.films import Take, gif, side_by_side, with_sky
 from mjx_reinforce.export.run_files import PolicyChoice, Run, SeedChoice, choose_seed, read_run
+from mjx_reinforce.export.term_charts import draw_terms
 from mjx_reinforce.files import check_output, write_bytes
 from mjx_reinforce.settings.config import check_named
 from mjx_reinforce.settings.flags import run_command
@@ -49,6 +50,9 @@ class WatchSettings:
     """Show the policy before training on the left, from the same start."""
     episode: int = 0
     """Number of the start state. The same number gives the same start."""
+    chart: Path | None = None
+    """Also draw a chart, .png: each term of the reward in every env step and, if the task has a
+    command, the command beside what the robot does."""
     noise: bool = False
     """Draw actions from the policy, as training does, instead of taking its mode."""
     output: Path | None = None
@@ -82,6 +86,8 @@ def film(settings: WatchSettings) -> None:
         raise ValueError(f"--env is {settings.env}, but {run.directory} was trained on {run.env}")
     check_named({"env": run.env}, {"env": settings.env}, run.directory)
     output = film_path(settings, run)
+    if settings.chart is not None:
+        check_output(settings.chart, settings.overwrite, ".png")
     check_drawing()
     configure_jax()
     from mjx_reinforce.export.policy_files import load_seed
@@ -105,6 +111,9 @@ def film(settings: WatchSettings) -> None:
     samples = [*map(shown.draw, shown.samples)]
     frames = map(shown.draw, track(range(shown.length), "drawing", transient=True))
     write_bytes(output, gif(frames, shown.rate, samples))
+    if settings.chart is not None:
+        write_bytes(settings.chart, draw_terms(takes[-1]))
+        print(f"the terms of the reward in {settings.chart}")
     # ``qpos`` has a row more than there are steps: the start's.
     episode_seconds = max((len(take.qpos) - 1) * take.dt for take in takes)
     text = f"{shown.length} frames in {output}"

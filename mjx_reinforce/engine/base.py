@@ -23,7 +23,9 @@ MjSpec: TypeAlias = Any
 Act: TypeAlias = Callable[[Any, jax.Array], jax.Array]
 
 
-@typing.dataclass_transform(frozen_default=True, kw_only_default=True)
+@typing.dataclass_transform(
+    frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field,)
+)
 class Arrays:
     """A frozen dataclass of arrays, or of pytrees of them, that is a pytree in field order."""
 
@@ -129,7 +131,7 @@ class Acts(Protocol):
 
 
 #: The fields of a trajectory that have an entry for each step, [T, N, ...].
-_STEP_FIELDS = ("observation", "action", "reward", "mask")
+_STEP_FIELDS = ("observation", "action", "reward", "mask", "terms")
 
 
 class Trajectory(Arrays):
@@ -143,6 +145,8 @@ class Trajectory(Arrays):
       nonfinite: [N] True where the simulation left the finite numbers
       simulated: [] int32, env steps that were simulated for these episodes, those in which an
         episode was over already included
+      terms: [T, N] each, the terms of the reward by their names, see ``term_names``; zero where
+        the episode is over
 
     Examples:
       >>> import jax, jax.numpy as jnp
@@ -162,6 +166,7 @@ class Trajectory(Arrays):
     mask: jax.Array
     nonfinite: jax.Array
     simulated: jax.Array
+    terms: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
 
     def __repr__(self) -> str:
         # Shapes say what it is; the arrays would be pages of numbers.
@@ -171,13 +176,17 @@ class Trajectory(Arrays):
 
     def first(self, steps: int) -> "Trajectory":
         """Returns the first so many steps of every episode."""
-        return self.replace(**{name: getattr(self, name)[:steps] for name in _STEP_FIELDS})
+        return self._of_steps(lambda x: x[:steps])
 
     def episodes(self, part: slice) -> "Trajectory":
         """Returns a part of the episodes; ``simulated`` remains that of all."""
         # Time is the first axis of these, episodes the second.
-        step_fields = {name: getattr(self, name)[:, part] for name in _STEP_FIELDS}
-        return self.replace(**step_fields, nonfinite=self.nonfinite[part])
+        return self._of_steps(lambda x: x[:, part]).replace(nonfinite=self.nonfinite[part])
+
+    def _of_steps(self, change: Callable[[jax.Array], jax.Array]) -> "Trajectory":
+        """Returns the same with a change of all arrays [T, N, ...]."""
+        step_fields = {name: getattr(self, name) for name in _STEP_FIELDS}
+        return self.replace(**jax.tree.map(change, step_fields))
 
 
 def action_space(env: Environment) -> Box | Discrete:
@@ -250,6 +259,33 @@ def observation_size(env: Environment) -> int:
             "flatten it in a wrapper"
         )
     return obs.shape[0]
+
+
+#: The metrics of an environment that are terms of its reward: Gymnasium's ``reward_forward``, and
+#: MuJoCo Playground's ``reward/forward``.
+_TERM_PREFIXES = ("reward_", "reward/")
+
+
+def term_names(env: Environment) -> tuple[str, ...]:
+    """Returns the names of the reward's terms, in the order of the task; none of a single one.
+
+    They are the numbers [] among the ``metrics`` of the state, of brax's interface, that begin with
+    "reward_" or "reward/". One term alone would be the reward again.
+    """
+    names: list[str] = []
+
+    def reset(rng: jax.Array) -> Any:
+        """Resets the environment, and keeps the names."""
+        state = env.reset(rng)
+        # JAX sorts the names in what a function returns: the order is seen here alone.
+        metrics = getattr(state, "metrics", None)
+        if isinstance(metrics, dict):  # what a state of the user's own calls so may be anything
+            terms = {x: y for x, y in metrics.items() if str(x).startswith(_TERM_PREFIXES)}
+            names[:] = [x for x, term in terms.items() if getattr(term, "shape", None) == ()]
+        return state
+
+    shapes(reset, jax.random.key(0))
+    return tuple(names) if len(names) > 1 else ()
 
 
 def is_key(leaf: Any) -> bool:

@@ -6,7 +6,7 @@ reads and returns.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -34,6 +34,7 @@ class Step(NamedTuple):
     alive: [] or [N] whether the episode goes on
     broken: [] or [N] whether this step left the finite numbers, which ends the episode
     state: the environment's next state, also where the episode was over: see ``hold``
+    terms: [] or [N] each, the reward's terms by name; zero where the reward is
     """
 
     observation: jax.Array
@@ -42,6 +43,7 @@ class Step(NamedTuple):
     alive: jax.Array
     broken: jax.Array
     state: Any
+    terms: dict[str, jax.Array]
 
 
 def check_each(num_episodes: int, **arguments: ArrayLike) -> None:
@@ -101,6 +103,7 @@ def step(
     noise: jax.Array,
     alive: jax.Array,
     deterministic: jax.Array | None = None,
+    terms: Sequence[str] = (),
 ) -> Step:
     """Plays one step.
 
@@ -113,6 +116,7 @@ def step(
       noise: [E] or [N, E] what the action is drawn from.
       alive: [] or [N] whether the episode is still running.
       deterministic: [] or [N] whether the action is the mode instead; by default it never is.
+      terms: the names of the reward's terms that are returned.
     """
     # N is the last axis of the state and the first of what the policy reads: hence ``.T``, which
     # leaves the vector of one episode as it is.
@@ -126,13 +130,15 @@ def step(
     is_finite = jnp.all(jnp.isfinite(next_state.obs), axis=0)
     is_finite &= jnp.isfinite(next_state.reward) & jnp.isfinite(next_state.done)
     is_broken = alive & ~is_finite
+    is_paid = alive & ~is_broken
     return Step(
         observation=observation,
         action=_choose(alive, action, jnp.zeros_like(action)),
-        reward=jnp.where(alive & ~is_broken, next_state.reward, 0.0),
-        alive=alive & ~is_broken & (next_state.done == 0),
+        reward=jnp.where(is_paid, next_state.reward, 0.0),
+        alive=is_paid & (next_state.done == 0),
         broken=is_broken,
         state=next_state,
+        terms={x: jnp.where(is_paid, next_state.metrics[x], 0.0) for x in terms},
     )
 
 

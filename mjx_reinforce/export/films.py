@@ -4,12 +4,13 @@ import functools
 import io
 import math
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.engine.vector.pictures import Renderer, import_mujoco
+from mjx_reinforce.engine.vector.pictures import Arrow, Renderer, import_mujoco
 
 if TYPE_CHECKING:
     from mjx_reinforce.engine.base import MjSpec
@@ -47,6 +48,13 @@ _WORDS = 1 / 19
 _LEAST = 10
 _INK = (235, 240, 245)
 _PAPER = (28, 38, 48)
+#: The colors of a commanded velocity and of the robot's.
+_COMMAND_INK = (255, 176, 32)
+_ROBOT_INK = (64, 200, 255)
+#: The robot's velocity is that over so long (s): from step to step it sways with the gait.
+_WINDOW = 0.2
+#: The words say so long (s) that the robot was pushed.
+_PUSH_SECONDS = 0.5
 
 
 class Take(NamedTuple):
@@ -57,6 +65,10 @@ class Take(NamedTuple):
     dt: the duration of an env step (s)
     qpos: [L, nq] generalized positions (m, rad), the start's first
     rewards: [T] of each env step
+    terms: [T] each, terms of the reward by name; none where it has fewer than two
+    commands: [L, K] what the robot is to do at each of the positions, if that is known. Three
+      numbers are a velocity in the robot's frame: forward, sideways (m/s), turning (rad/s)
+    pushes: [T] whether an env step began with a push, if that is known
     """
 
     label: str
@@ -64,6 +76,9 @@ class Take(NamedTuple):
     dt: float
     qpos: np.ndarray
     rewards: np.ndarray
+    terms: Mapping[str, np.ndarray] = MappingProxyType({})
+    commands: np.ndarray | None = None
+    pushes: np.ndarray | None = None
 
 
 class Film(NamedTuple):
@@ -127,16 +142,88 @@ def _picture(take: Take, renderer: Renderer, seconds: float) -> np.ndarray:
     """Returns a take's picture at a time (s)."""
     # A take that ended keeps its last position.
     step = min(int(seconds / take.dt + 1e-6), len(take.qpos) - 1)
-    picture = renderer.draw(take.qpos[step])
+    arrows, strips = _command_shown(take, step)
+    picture = renderer.draw(take.qpos[step], arrows)
     total_reward = np.sum(take.rewards[:step])
     digits = 0 if abs(total_reward) >= 100 else 1
-    return caption(
-        picture, take.label, f"return {total_reward:,.{digits}f}   {step * take.dt:4.1f} s"
-    )
+    note = f"return {total_reward:,.{digits}f}   {step * take.dt:4.1f} s"
+    first = max(0, step - round(_PUSH_SECONDS / take.dt))
+    if take.pushes is not None and take.pushes[first:step].any():
+        note = f"pushed   {note}"
+    picture = caption(picture, take.label, note)
+    for words in strips:
+        picture = caption(picture, *words, inks=(_COMMAND_INK, _ROBOT_INK))
+    return picture
 
 
-def caption(picture: np.ndarray, label: str, note: str) -> np.ndarray:
-    """Returns a picture [H, W, 3] uint8 above a strip with a label on the left, a note right."""
+def _command_shown(take: Take, step: int) -> tuple[list[Arrow], list[tuple[str, str]]]:
+    """Returns the arrows of a command and of what the robot does, and the words of a strip."""
+    if take.commands is None:
+        return [], []
+    command = take.commands[step]
+    if command.size != 3 or (paths := robot_paths(take)) is None:
+        return [], [("command " + ", ".join(map(_short, command)), "")]
+    speeds = velocities(take, paths)[step]
+    heading = paths[step, 2]
+    forward, sideways, turning = map(_short, command)
+    words = f"command {forward} m/s, {sideways} m/s, {turning} rad/s"
+    arrows = [
+        Arrow(_in_world(speeds, heading), _ROBOT_INK),
+        Arrow(_in_world(command, heading), _COMMAND_INK),
+    ]
+    return arrows, [(words, "robot " + ", ".join(map(_short, speeds)))]
+
+
+def robot_paths(take: Take) -> np.ndarray | None:
+    """Returns where a robot is, x and y (m), and its heading (rad), [L, 3] at each position.
+
+    The robot is the body of the first free joint; None without one.
+    """
+    free = np.flatnonzero(take.model.jnt_type == import_mujoco().mjtJoint.mjJNT_FREE)
+    if not free.size:
+        return None
+    start = take.model.jnt_qposadr[free[0]]
+    w, x, y, z = take.qpos[:, start + 3 : start + 7].T
+    heading = np.arctan2(2 * (w * z + x * y), w**2 + x**2 - y**2 - z**2)
+    return np.column_stack([take.qpos[:, start : start + 2], np.unwrap(heading)])
+
+
+def velocities(take: Take, paths: np.ndarray) -> np.ndarray:
+    """Returns a robot's velocity at each position, [L, 3], as three numbers of a command.
+
+    It is the mean over ``_WINDOW``, or since the start.
+
+    Args:
+      take: of the robot.
+      paths: of ``robot_paths``.
+    """
+    steps = np.arange(len(paths))
+    before = np.maximum(steps - max(1, round(_WINDOW / take.dt)), 0)
+    seconds = take.dt * np.maximum(steps - before, 1)
+    x, y, turning = ((paths - paths[before]) / seconds[:, None]).T
+    cos, sin = np.cos(paths[:, 2]), np.sin(paths[:, 2])
+    return np.column_stack([cos * x + sin * y, cos * y - sin * x, turning])
+
+
+def _in_world(velocity: np.ndarray, heading: float) -> np.ndarray:
+    """Returns the velocity [3] in the world (m/s) of one as a command has it."""
+    forward, sideways, _ = velocity
+    cos, sin = np.cos(heading), np.sin(heading)
+    return np.array([cos * forward - sin * sideways, sin * forward + cos * sideways, 0.0])
+
+
+def _short(number: float) -> str:
+    """Returns a number with one digit behind the point; none is -0.0."""
+    return f"{round(float(number), 1) + 0.0:.1f}"
+
+
+def caption(
+    picture: np.ndarray, label: str, note: str, inks: Sequence[tuple[int, ...]] = (_INK, _INK)
+) -> np.ndarray:
+    """Returns a picture [H, W, 3] uint8 above a strip with a label on the left, a note right.
+
+    The two have colors of their own, ``inks``.
+    """
     from PIL import Image, ImageDraw
 
     height, width = picture.shape[:2]
@@ -149,8 +236,8 @@ def caption(picture: np.ndarray, label: str, note: str) -> np.ndarray:
     if draw.textlength(label + note, font) > width - 3 * strip // 2:
         font = _font(max(_LEAST, round(height * _WORDS * 0.8)))
     middle = height + strip // 2
-    draw.text((strip // 3, middle), label, fill=_INK, font=font, anchor="lm")
-    draw.text((width - strip // 3, middle), note, fill=_INK, font=font, anchor="rm")
+    draw.text((strip // 3, middle), label, fill=inks[0], font=font, anchor="lm")
+    draw.text((width - strip // 3, middle), note, fill=inks[1], font=font, anchor="rm")
     return np.asarray(image)
 
 

@@ -11,7 +11,14 @@ import jinja2
 from markupsafe import Markup
 
 from mjx_reinforce.reports import charts, words
-from mjx_reinforce.reports.charts import curves, distribution, final, sensitivity, solved
+from mjx_reinforce.reports.charts import (
+    curves,
+    distribution,
+    final,
+    sensitivity,
+    solved,
+    terms,
+)
 from mjx_reinforce.reports.experiment import Experiment, counted, say, setting_in_words
 from mjx_reinforce.reports.findings import COMPARED, Findings
 from mjx_reinforce.reports.listings import listings
@@ -19,7 +26,7 @@ from mjx_reinforce.reports.words import steps
 from mjx_reinforce.statistics import enough
 
 #: The charts in the order of the page.
-_CHARTS = (final, curves, solved, distribution, sensitivity)
+_CHARTS = (final, curves, solved, terms, distribution, sensitivity)
 _TEMPLATES = resources.files("mjx_reinforce.reports") / "files"
 
 
@@ -116,7 +123,7 @@ def _text(findings: Findings, drawn: list[charts.Chart]) -> dict[str, Any]:
     sensitivity = [figure for figure in drawn if figure.name.startswith("sensitivity-")]
     tables = listings(findings)
     # A chart that shows nothing is None, so that the template can ask for it.
-    chart_names = ("final", "curves", "solved", "distribution")
+    chart_names = ("final", "curves", "solved", "terms", "distribution")
     failures = any(not math.isfinite(x) for result in findings.results for x in result.final)
     return {
         "answer": words.headline(findings),

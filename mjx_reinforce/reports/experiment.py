@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ class Configuration(NamedTuple):
     nonfinite: [S] updates that met numbers which are not finite
     seed: [S] each seed's number in its source
     directories: [S] the directory of each
+    terms: [E, S] each, sums of the reward's terms over an episode, by their names; of a sweep none
     """
 
     label: str
@@ -26,6 +28,7 @@ class Configuration(NamedTuple):
     nonfinite: np.ndarray
     seed: np.ndarray
     directories: Sequence[Path] = ()
+    terms: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
 class Source(NamedTuple):

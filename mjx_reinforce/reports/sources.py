@@ -44,6 +44,8 @@ _TIMINGS = ("compile_seconds", "run_seconds", "statistics_seconds")
 _SWEEP_KEYS = ("status", "env", "threshold", "settings", "configurations", *_TIMINGS)
 #: The columns and arrays that are read, and their types.
 _METRICS = {"seed": np.int64, "env_steps": np.int64, "eval_return": np.float64}
+#: How the columns of the reward's terms begin.
+_TERM = "eval_reward"
 _CURVES = {
     "configuration": np.int64,
     "seed": np.int64,
@@ -158,13 +160,16 @@ def _join_parts(parts: Sequence[Configuration]) -> Configuration:
             "each share its own --seeds, or leave one out"
         )
 
-    def joined(name: str) -> np.ndarray:
-        curves = [lengthened(getattr(part, name), length) for part in parts]
-        return np.concatenate(curves, axis=1)[:, order]
+    def joined(curves: Sequence[np.ndarray]) -> np.ndarray:
+        return np.concatenate([lengthened(x, length) for x in curves], axis=1)[:, order]
+
+    # Shares of other versions of the package may lack terms.
+    names = [name for name in parts[0].terms if all(name in part.terms for part in parts)]
 
     return parts[0]._replace(
-        eval_return=joined("eval_return"),
-        env_steps=joined("env_steps"),
+        eval_return=joined([part.eval_return for part in parts]),
+        env_steps=joined([part.env_steps for part in parts]),
+        terms={name: joined([part.terms[name] for part in parts]) for name in names},
         nonfinite=np.concatenate([part.nonfinite for part in parts])[order],
         seed=seed,
         directories=[directories[i] for i in order],
@@ -265,6 +270,7 @@ def read_directory(directory: Path) -> Source:
 def _read_run(directory: Path, config: dict[str, Any]) -> Source:
     """Reads a run with this config.json."""
     columns = read_metrics(directory / "metrics.csv")
+    terms = {x.removeprefix("eval_"): columns.pop(x) for x in [*columns] if x not in _METRICS}
     num_seeds = len(columns["seed"])
     # The summary is written at the end; until then the run is read as far as it came.
     path = directory / "summary.json"
@@ -277,7 +283,12 @@ def _read_run(directory: Path, config: dict[str, Any]) -> Source:
         nonfinite = np.broadcast_to(counts, num_seeds)
         outcome = _outcome(summary)
     part = Configuration(
-        directory.name, {}, nonfinite=nonfinite, directories=[directory] * num_seeds, **columns
+        directory.name,
+        {},
+        nonfinite=nonfinite,
+        directories=[directory] * num_seeds,
+        terms=terms,
+        **columns,
     )
     provenance = {name: value for name, value in config.items() if name in PROVENANCE}
     # The engine that was chosen, in place of "auto" in the settings.
@@ -305,7 +316,7 @@ def _read_sweep(directory: Path, content: dict[str, Any]) -> Source:
         for number in np.unique(curves["configuration"]):
             settings = swept[f"configuration {number}"]
             runs = curves["configuration"] == number
-            columns = {name: curves[name][..., runs] for name in _COLUMNS}
+            columns: dict[str, Any] = {name: curves[name][..., runs] for name in _COLUMNS}
             directories = [directory] * int(runs.sum())
             label = settings_in_words(settings)
             parts.append(Configuration(label, settings, directories=directories, **columns))
@@ -354,13 +365,14 @@ def _check_steps(env_steps: np.ndarray) -> None:
 def read_metrics(path: Path) -> dict[str, np.ndarray]:
     """Returns the columns ``env_steps`` and ``eval_return`` [E, S] of a metrics.csv, ``seed`` [S].
 
-    A last line or evaluation that is not whole, which a killed run may leave, is left out.
+    Behind them are the columns of the reward's terms [E, S], if there are any. A last line or
+    evaluation that is not whole, which a killed run may leave, is left out.
 
     Raises:
       ValueError: the file cannot be read, a column is missing, an entry is no number, the rows are
         not in the order of the seeds, or env steps fall.
     """
-    columns = read_columns(path, _METRICS)
+    columns = read_columns(path, _METRICS, _TERM)
     seed = columns["seed"]
     if not len(seed):
         raise ValueError(f"{path} has no evaluation yet; wait for the first, or train again")
@@ -370,20 +382,23 @@ def read_metrics(path: Path) -> dict[str, np.ndarray]:
         raise ValueError(f"{path} is damaged: its lines are not in the order of the seeds")
     num_evaluations = len(seed) // num_seeds
     curves = {
-        name: columns[name][: num_evaluations * num_seeds].reshape(num_evaluations, num_seeds)
-        for name in ("env_steps", "eval_return")
+        name: column[: num_evaluations * num_seeds].reshape(num_evaluations, num_seeds)
+        for name, column in columns.items()
     }
     with naming_damage(path):
         _check_steps(curves["env_steps"])
     return curves | {"seed": seed[:num_seeds]}
 
 
-def read_columns(path: Path, kinds: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def read_columns(
+    path: Path, kinds: Mapping[str, Any], prefix: str | None = None
+) -> dict[str, np.ndarray]:
     """Returns columns of a CSV file by name; a last line that is not whole is left out.
 
     Args:
       path: of the file, whose first line has the names of the columns.
       kinds: the type of each column that is wanted.
+      prefix: how the names of further columns begin, of floats, if any are wanted.
 
     Raises:
       ValueError: the file cannot be read, a column is missing, a row too short or long, or an entry
@@ -399,4 +414,6 @@ def read_columns(path: Path, kinds: Mapping[str, Any]) -> dict[str, np.ndarray]:
         columns = {name: [] for name in header}
         if rows:
             columns = dict(zip(header, zip(*rows, strict=True), strict=True))
+        if prefix is not None:
+            kinds = {**kinds, **{x: np.float64 for x in columns if x.startswith(prefix)}}
         return {name: np.array(columns[name], kind) for name, kind in kinds.items()}

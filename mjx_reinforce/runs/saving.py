@@ -39,7 +39,7 @@ from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup.provenance import provenance
 from mjx_reinforce.training import resume
 from mjx_reinforce.training.driver import Driver, DriverT, Evaluation, Observer, RunDriver, Runs
-from mjx_reinforce.training.record import HEADER, lines
+from mjx_reinforce.training.record import header, lines
 from mjx_reinforce.training.resume import Checkpoint
 
 #: Between checkpoints (s), where the user has not said how many updates.
@@ -182,6 +182,7 @@ class RunFiles(Files[RunDriver]):
         super().__init__(directory, plan, say)
         self._metrics = directory / "metrics.csv"
         self._checkpoints = directory / "checkpoint"
+        self._columns: list[str] = []
         #: Rows that could not be written yet.
         self._waiting = b""
         #: Where rows go besides metrics.csv.
@@ -202,6 +203,9 @@ class RunFiles(Files[RunDriver]):
             num_updates = driver.updates() if checkpoint is not None else 0
             reason = "" if num_updates else ": there is no checkpoint yet, so it begins again"
             self._say(f"going on after {num_updates} updates{reason}")
+        # A run that an older version began goes on with the columns that its file has.
+        with self._metrics.open(encoding="utf-8") as file:
+            self._columns = file.readline().strip().split(",")
         last_update = None
         if checkpoint is not None:
             # The evaluation of the present policies is made again, unless the record has it.
@@ -214,7 +218,7 @@ class RunFiles(Files[RunDriver]):
         del settings["resume"]
         played_by = {"played_by": self._plan.group_plans[0].ready.engine}
         self._write_json("config.json", settings | played_by | provenance())
-        write_bytes(self._metrics, HEADER)
+        write_bytes(self._metrics, header(self._plan.group_plans[0].ready.terms))
 
     def _take_back(self, driver: RunDriver, checkpoint: Checkpoint | None) -> None:
         """Takes the files back to a checkpoint, and says in config.json that the run goes on.
@@ -233,7 +237,7 @@ class RunFiles(Files[RunDriver]):
         self._write_json("summary.json", {"status": "running", **run_progress})
         if checkpoint is None:
             resume.remove_checkpoints(self._checkpoints, last_number=0)
-            write_bytes(self._metrics, HEADER)
+            write_bytes(self._metrics, header(self._plan.group_plans[0].ready.terms))
         else:
             resume.remove_checkpoints(self._checkpoints, last_number=checkpoint.number)
             files.cut(self._metrics, checkpoint.metrics_bytes)
@@ -241,7 +245,7 @@ class RunFiles(Files[RunDriver]):
     def evaluated(self, driver: RunDriver, evaluation: Evaluation, rows: Arrays) -> None:
         """Writes the rows of an evaluation."""
         # Together with what a full disk did not take before, so that no row is lost.
-        self._waiting += lines(rows)
+        self._waiting += lines(rows, self._columns)
         self._attempt("metrics.csv", self._write_rows)
         for sink in self._sinks:
             self._attempt(sink.name, functools.partial(sink.write, rows))

@@ -13,14 +13,14 @@ import hashlib
 import importlib
 import json
 import warnings
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from mjx_reinforce import envs
-from mjx_reinforce.engine.base import Environment, PyTree, is_key
+from mjx_reinforce.engine.base import Environment, PyTree, is_key, term_names
 from mjx_reinforce.engine.cache import Cache
 from mjx_reinforce.envs.settings import split_words
 from mjx_reinforce.learning.learner import Learner
@@ -43,6 +43,7 @@ class Ready(NamedTuple):
     policy: how to rebuild its policy, see ``policy_files.save_policy``
     engine: the name of what plays the episodes
     why: the reason it was chosen, for people
+    terms: the names of the reward's terms, in the order of the task
     programs: () -> those of the runs, before they are compiled; made when they are first asked for
     """
 
@@ -51,6 +52,7 @@ class Ready(NamedTuple):
     policy: dict[str, Any]
     engine: str
     why: str
+    terms: Sequence[str]
     programs: Callable[[], Programs]
 
 
@@ -178,6 +180,7 @@ def build_ready(
         policy=built.policy,
         engine=learner.engine.name,
         why=learner.engine.why,
+        terms=term_names(env),
         programs=programs,
     )
 

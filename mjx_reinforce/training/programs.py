@@ -242,10 +242,11 @@ def evaluation_metrics(
     """Returns what the episodes of an evaluation show.
 
     ``eval_return`` and ``eval_length`` [], means over the deterministic episodes,
-    ``eval_return_stochastic`` [], over the sampled ones if there are any, ``eval_steps`` [], the
-    steps of all episodes, and ``simulated_steps`` [], those that were simulated for them alone:
-    none where they shared the launch of others. A return is NaN if one of its episodes left the
-    finite numbers: what that earned until then says nothing.
+    ``eval_return_stochastic`` [], over the sampled ones if there are any, and then for each
+    term of the reward, as "eval_reward_forward" [], the mean of its sums over a deterministic
+    episode; ``eval_steps`` [], the steps of all episodes, and ``simulated_steps`` [], those that
+    were simulated for them alone: none where they shared the launch of others. A return is NaN if
+    one of its episodes left the finite numbers: what that earned until then says nothing.
     """
     returns = episode_returns(trajectory)
     lengths = episode_lengths(trajectory)
@@ -255,6 +256,10 @@ def evaluation_metrics(
     sampled_metrics = {}
     if len(evaluation.keys) > modes:
         sampled_metrics["eval_return_stochastic"] = jnp.mean(returns[modes:])
+        # Not where modes alone are played, in a sweep: it records no more than returns.
+        for name, rewards in trajectory.terms.items():
+            sums = jnp.where(trajectory.nonfinite, jnp.nan, jnp.sum(rewards, axis=0))
+            sampled_metrics[f"eval_{name}"] = jnp.mean(sums[:modes])
     return sampled_metrics | {
         "eval_return": jnp.mean(returns[:modes]),
         "eval_length": jnp.mean(lengths[:modes]),

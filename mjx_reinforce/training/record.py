@@ -50,7 +50,8 @@ COLUMNS = (
     "explained_variance",
     "gradient_snr",
 )
-HEADER = (",".join(COLUMNS) + "\n").encode()
+#: How the columns behind these begin, one for each term of the reward.
+TERM_COLUMN = "eval_reward"
 #: What these columns are called among the metrics of an update.
 _METRIC_OF_COLUMN = {"train_return": "episode_return", "train_length": "episode_length"}
 
@@ -60,19 +61,31 @@ def as_rows(measured: Arrays, seconds: float) -> Arrays:
 
     Args:
       measured: [S] each, by column, or as ``_METRIC_OF_COLUMN``. What was not measured is no
-        column. A return is NaN if one of its episodes was not finite.
+        column; terms of the reward are those whose names begin with ``TERM_COLUMN``. A return is
+        NaN if one of its episodes was not finite.
       seconds: wall time since compilation ended.
     """
     clock = np.full(len(measured["seed"]), round(seconds, 3))
     columns = {column: measured.get(_METRIC_OF_COLUMN.get(column, column)) for column in COLUMNS}
-    return {n: x for n, x in columns.items() if x is not None} | {"wall_seconds": clock}
+    terms = {name: x for name, x in measured.items() if name.startswith(TERM_COLUMN)}
+    return {n: x for n, x in columns.items() if x is not None} | terms | {"wall_seconds": clock}
 
 
-def lines(rows: Arrays) -> bytes:
-    """Returns rows as metrics.csv has them; cells of what was not measured are empty."""
-    columns = {name: [""] * len(rows["seed"]) for name in COLUMNS}
-    columns |= {name: _cells(rows[name]) for name in COLUMNS if name in rows}
-    return "".join(",".join(row) + "\n" for row in zip(*columns.values(), strict=True)).encode()
+def header(terms: Sequence[str]) -> bytes:
+    """Returns the first line of metrics.csv, for a task whose reward has these terms."""
+    return (",".join([*COLUMNS, *(f"eval_{name}" for name in terms)]) + "\n").encode()
+
+
+def lines(rows: Arrays, columns: Sequence[str] = COLUMNS) -> bytes:
+    """Returns rows as metrics.csv has them; cells of what was not measured are empty.
+
+    Args:
+      rows: of ``as_rows``.
+      columns: those of the file.
+    """
+    cells = {name: [""] * len(rows["seed"]) for name in columns}
+    cells |= {name: _cells(rows[name]) for name in columns if name in rows}
+    return "".join(",".join(row) + "\n" for row in zip(*cells.values(), strict=True)).encode()
 
 
 def _cells(values: np.ndarray) -> Sequence[str]:

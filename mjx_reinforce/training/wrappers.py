@@ -38,6 +38,7 @@ _EPISODES = _TrajectorySpecs(
     mask=SECOND,
     nonfinite=RUNS,
     simulated=NONE,
+    terms=SECOND,
 )
 
 #: Metrics without which no run can be recorded.

@@ -26,13 +26,17 @@ def actor_and_act(env, hidden_sizes, seed=0, distribution=None):
     return actor, act, policy.distribution
 
 
+_COMPARED = ("observation", "action", "reward")
+
+
 def assert_same_episodes(got, want, *, rounding):
     np.testing.assert_array_equal(got.mask, want.mask)
     np.testing.assert_array_equal(got.nonfinite, want.nonfinite)
-    for name in ("observation", "action", "reward"):
-        np.testing.assert_allclose(
-            getattr(got, name), getattr(want, name), atol=rounding, rtol=rounding, err_msg=name
-        )
+    assert got.terms.keys() == want.terms.keys()
+    compared = {name: (getattr(got, name), getattr(want, name)) for name in _COMPARED}
+    compared |= {name: (got.terms[name], want.terms[name]) for name in got.terms}
+    for name, pair in compared.items():
+        np.testing.assert_allclose(*pair, atol=rounding, rtol=rounding, err_msg=name)
 
 
 def played(play, env, player, num_seeds=3, num_episodes=5, **options):

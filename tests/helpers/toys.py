@@ -206,3 +206,27 @@ class Bytes(Drifting):
         number = number + jnp.int8(50)
         reward = after.reward + number.astype(after.reward.dtype)
         return after.replace(info=(*after.info, number), reward=reward)
+
+
+@struct.dataclass
+class PaidState(ToyState):
+    metrics: dict[str, jax.Array] = struct.field(default_factory=dict)
+
+
+class Paid(Drifting):
+    """Pays for two things, tells a third, and breaks far out."""
+
+    names = ("reward_speed", "reward_effort", "height")
+    breaks_at = 0.3
+
+    def reset(self, rng):
+        state = super().reset(rng)
+        metrics = dict.fromkeys(self.names, jnp.zeros(()))
+        return PaidState(state.obs, state.reward, state.done, state.info, metrics)
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        broken = jnp.where(after.obs[0] > self.breaks_at, jnp.nan, 0.0)
+        values = after.obs[0] + broken, -0.1 * jnp.sum((action - 0.5) ** 2), after.obs[1]
+        metrics = dict(zip(self.names, values, strict=False))
+        return after.replace(reward=values[0] + values[1], metrics=metrics)

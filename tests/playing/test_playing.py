@@ -86,6 +86,58 @@ def test_an_episode_in_c_mujoco_ends_as_the_task_says():
     assert falling.rewards[-1] == 0
 
 
+class Told(Pole):
+    """Has a command that changes, and is pushed where it does."""
+
+    def memory(self, rng, data):
+        return {"command": jnp.zeros(3), "step": 0}
+
+    def remember(self, rng, data, action):
+        step = data.memory["step"] + 1
+        command = jnp.where(step % 4 == 0, jax.random.uniform(rng, (3,)), data.memory["command"])
+        return {"command": command, "step": step}
+
+    def push(self, before):
+        is_due = before.memory["step"] % 4 == 3
+        return jnp.zeros(self.mj_model.nv).at[0].set(jnp.where(is_due, 0.1, 0.0))
+
+    def outcome(self, before, data, action):
+        terms = {"reward_speed": data.qvel[0], "reward_alive": 1.0, "height": 5.0}
+        return data.qvel[0] + 1.0, False, terms
+
+
+@pytest.mark.slow
+def test_an_episode_has_its_terms_its_commands_and_its_pushes(tmp_path):
+    env = Told()
+    size = env.observation_size
+    player = load(make_run(tmp_path, "InvertedPendulum-v5", observation_size=size))
+    ours = playing.simulator(env, player, 10)(3, False)
+    theirs = playing.mujoco_simulator(env, player, 10)(3, False)
+    for episode in (ours, theirs):
+        assert [*episode.terms] == ["reward_speed", "reward_alive"]
+        np.testing.assert_allclose(sum(episode.terms.values()), episode.rewards, rtol=1e-5)
+        assert episode.commands.shape == (11, 3)
+        changes = np.any(np.diff(episode.commands, axis=0) != 0, axis=1)
+        assert np.flatnonzero(changes).tolist() == [3, 7]
+    np.testing.assert_allclose(ours.commands, theirs.commands)
+    assert np.flatnonzero(theirs.pushes).tolist() == [3, 7]
+    assert ours.pushes is None
+
+
+def test_a_command_may_be_that_of_the_episode(tmp_path):
+    class Sent(Pole):
+        def randomize(self, rng):
+            return {"command": jax.random.uniform(rng)}
+
+    env = Sent()
+    size = env.observation_size
+    player = load(make_run(tmp_path, "InvertedPendulum-v5", observation_size=size))
+    commands = playing.mujoco_simulator(env, player, 5)(3, False).commands
+    assert commands.shape == (6, 1)
+    assert np.unique(commands).size == 1
+    assert commands[0] > 0
+
+
 def test_the_package_says_what_its_policies_earn():
     """Of one episode, in another simulation than the one that measured it."""
     facts, player = pretrained()["HalfCheetah-v5"], load("HalfCheetah-v5")

@@ -177,7 +177,7 @@ class Blank:
     def __init__(self, model, width, height):
         self.shape, self.drawn = (height, width, 3), 0
 
-    def draw(self, qpos):
+    def draw(self, qpos, arrows=()):
         self.drawn += 1
         return np.full(self.shape, self.drawn, np.uint8)
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from fake_sweeps import make_sweep
-from measured_runs import ONE
+from measured_runs import ONE, make_measured_run
 from pages import findings_of
 
 from mjx_reinforce.reports import charts, findings, words
@@ -57,6 +57,24 @@ def test_without_a_threshold_nothing_is_solved(found):
     assert [name for _, name in numbers(without)][:3] == ["final", "curves", "distribution"]
     assert all("solved" not in json.dumps(each.spec) for each in draw_charts(without))
     assert charts.threshold_line(without, "x", np.arange(2000)) == []
+
+
+def test_terms_of_the_reward_have_a_line_each(tmp_path):
+    """The mean over seeds; a term that is 0 throughout too. Of several runs the best one's."""
+    terms = ("reward_forward", "reward_ctrl")
+    worse, best = (
+        make_measured_run(tmp_path / name, offset=offset, terms=terms)
+        for name, offset in (("worse", 0.0), ("best", 50.0))
+    )
+    made = {each.name: each for each in draw_charts(findings_of(worse, best))}
+    table = made["terms"].data["terms"]
+    ends = dict(zip(table["term"], table["sum"], strict=True))  # the last of each
+    assert ends == {"reward_forward": 0, "reward_ctrl": 100 + 30 + 50}
+    assert [*ends] == [*terms]
+    assert "of best alone" in made["terms"].caption
+    assert [each.name for each in made.values()].index("terms") < [*made].index("distribution")
+    without = make_measured_run(tmp_path / "without")
+    assert "terms" not in {each.name for each in draw_charts(findings_of(without))}
 
 
 def test_axes_end_where_the_data_do(found, drawn):

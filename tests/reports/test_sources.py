@@ -46,6 +46,21 @@ def test_shares_of_a_run_are_one_run(tmp_path):
     assert [path.name for path in part.directories] == ["a", "a", "a", "b", "b"]
 
 
+def test_shares_of_a_run_join_the_terms_that_all_have(tmp_path):
+    """One of an older version has none."""
+    terms = ("reward_forward", "reward_ctrl")
+    shares = [
+        make_measured_run(tmp_path / "a", seeds="0:3", evaluations=3, terms=terms),
+        make_measured_run(tmp_path / "b", seeds="3:5", first=3, num_seeds=2, terms=terms),
+    ]
+    (part,) = sources.read_experiment(shares).configurations
+    assert [*part.terms] == ["reward_forward", "reward_ctrl"]
+    np.testing.assert_array_equal(part.terms["reward_ctrl"], part.eval_return)
+    older = make_measured_run(tmp_path / "c", seeds="5:6", first=5, num_seeds=1)
+    (part,) = sources.read_experiment([*shares, older]).configurations
+    assert part.terms == {}
+
+
 @pytest.mark.parametrize(
     "housekeeping", [{"log": ["tensorboard"]}, {"checkpoint_every": 5}, {"like": "other"}]
 )

@@ -42,7 +42,9 @@ class Run:
 def watched(tmp_path, monkeypatch):
     """The files of a run that has begun, what is written, what cannot be, what it said, the run."""
     written, full, said, run = [], set(), [], Run()
-    group_plan = SimpleNamespace(ready=SimpleNamespace(policy={"policy": "normal"}, engine="vmap"))
+    group_plan = SimpleNamespace(
+        ready=SimpleNamespace(policy={"policy": "normal"}, engine="vmap", terms=())
+    )
     plan = SimpleNamespace(saved_record={}, checkpoint=None, group_plans=[group_plan])
     files = RunFiles(tmp_path, plan, said.append)
     files.began(run)

@@ -42,7 +42,7 @@ def begin(directory, config):
     """Begins a run in a directory, or goes on without a checkpoint."""
     record = SimpleNamespace(env_steps=np.zeros(1))
     run = SimpleNamespace(config=config, updates=lambda: 0, record=record)
-    group_plan = SimpleNamespace(ready=SimpleNamespace(policy={}, engine="vmap"))
+    group_plan = SimpleNamespace(ready=SimpleNamespace(policy={}, engine="vmap", terms=()))
     plan = SimpleNamespace(saved_record={}, checkpoint=None, group_plans=[group_plan])
     files = RunFiles(directory, plan, lambda text: None)
     files.open()
@@ -52,7 +52,7 @@ def begin(directory, config):
 @pytest.fixture
 def directory(tmp_path):
     """A run's directory with its metrics.csv, and settings, as sinks find it."""
-    (tmp_path / "metrics.csv").write_bytes(record.HEADER)
+    (tmp_path / "metrics.csv").write_bytes(record.header(()))
     (tmp_path / "config.json").write_text('{"env": "Survive-v0", "learning_rate": 0.01}')
     return tmp_path
 

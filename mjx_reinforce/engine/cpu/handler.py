@@ -89,8 +89,8 @@ def handler_text(
       num_args: the number of arguments: limits [*B, N] int32 (of ``episode.signed_limits``),
       threads [*B] int32 (at most so many, 0 for all), keys [*B, N, 2] uint32, and the kernel's.
       result_bytes: the bytes of an element of each result: observation [*B, T, N, O],
-      action [*B, T, N, A], reward [*B, T, N], length [*B, N], broken [*B, N],
-      simulated [*B] int32.
+      action [*B, T, N, A], reward [*B, T, N (1 + K)] with its K terms behind each, length [*B, N],
+      broken [*B, N], simulated [*B] int32.
       lanes: the items that a thread plays at once; fewer are not worth a thread.
       positions: where other arguments and results than these have their sizes.
       is_zeroed: whether results are zero when ``@work`` begins.

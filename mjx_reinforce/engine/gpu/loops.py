@@ -159,8 +159,9 @@ def play_loop(
     int32 (of ``episode.signed_limits``), keys [S, N, 2] uint32, the leaves of the actor [S, ...]
     and of the state [S, N, ...] that are not empty; as many again as there are results, which it
     does not read; and the results, which are zero when it starts: observation [S, T, O, N], action
-    [S, T, A, N], reward [S, T, N], length [S, N] int32, broken [S, N] int32, simulated [S] int32
-    and next [1] int32, the item to be fetched next. Item k is episode k % N of seed k / N.
+    [S, T, A, N], reward [S, T, 1 + K, N] with its K terms behind it, length [S, N] int32, broken
+    [S, N] int32, simulated [S] int32 and next [1] int32, the item to be fetched next. Item k is
+    episode k % N of seed k / N.
     Episodes are the last axis of the records: workers side by side write to places side by side.
 
     Args:

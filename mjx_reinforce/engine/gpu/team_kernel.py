@@ -51,13 +51,18 @@ def player_text(program: scalarized.Scalarized, physics: Physics, num_actor: int
     words = [-(-leaf.size * leaf.itemsize // 4) for leaf in carried_leaves]
     offsets = dict(zip(arguments.carried, np.cumsum([0, *words]).tolist(), strict=False))
     text = CText(program, arguments.name, physics.skip)
-    observation, action, (reward,), (is_alive,), (is_broken,), *new_values = program.outputs
+    observation, action, rewards, (is_alive,), (is_broken,), *new_values = program.outputs
     text.line(f"const bool alive = {text.get(is_alive)} != 0;")
     text.line(f"const int is_broken = {text.get(is_broken)};")
-    record = [f"if (t.lane == 0) reward[row * episodes + column] = {text.get(reward)};"]
+    record = []
+    records = [("observation", observation), ("action", action)]
+    if len(rewards) == 1:
+        record = [f"if (t.lane == 0) reward[row * episodes + column] = {text.get(rewards[0])};"]
+    else:  # the reward's terms are behind it
+        records.append(("reward", rewards))
     record += [
         f"EACH(i, {len(x)}) {field}[(row * {len(x)} + i) * episodes + column] = {text.array(x)}[i];"
-        for field, x in (("observation", observation), ("action", action))
+        for field, x in records
     ]
     # Only what the step reads is carried on. To compute a leaf may read others, which then are
     # carried on, too: until no unwritten leaf is read.

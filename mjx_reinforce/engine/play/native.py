@@ -84,6 +84,9 @@ def native_rollout(
             gpu.launch(program.code, program.record, horizon, limits, words, *parameters, *starts)
         )
     observation, action, reward, length, is_broken, simulated = outputs
+    reward, *term_rewards = jnp.unstack(
+        reward.reshape(horizon, num_episodes, 1 + len(program.terms)), axis=-1
+    )
     return Trajectory(
         observation=observation,
         action=action.reshape(horizon, num_episodes, *program.record[1].shape),
@@ -91,6 +94,7 @@ def native_rollout(
         mask=jnp.arange(horizon)[:, None] < length,
         nonfinite=is_broken != 0,
         simulated=simulated,
+        terms=dict(zip(program.terms, term_rewards, strict=True)),
     )
 
 
@@ -127,7 +131,7 @@ def _episodes_before_numbers(outputs: Sequence[jax.Array]) -> Sequence[jax.Array
     """Returns a kernel's results with the records' axes in the order that a CPU writes them in."""
     # Threads of a warp write the same number of neighboring episodes at once: [T, numbers, N].
     observation, action, reward = (jnp.swapaxes(x, 1, 2) for x in outputs[:3])
-    return observation, action, reward[..., 0], *outputs[3:]
+    return observation, action, reward, *outputs[3:]
 
 
 def unsupported(
@@ -149,12 +153,13 @@ def _result_shapes(
     """Returns the shapes of what a call returns; see ``handler.handler_text``."""
     shape = jax.ShapeDtypeStruct
     observation, action, reward = program.record
-    size = int(np.prod(action.shape, dtype=int))
+    size, num_rewards = (int(np.prod(x.shape, dtype=int)) for x in (action, reward))
     flags = shape((num_episodes,), jnp.int32)
     return [
         shape((horizon, num_episodes, *observation.shape), observation.dtype),
         shape((horizon, num_episodes, size), action.dtype),
-        shape((horizon, num_episodes), reward.dtype),
+        # Of two axes: the handler reads T from it.
+        shape((horizon, num_episodes * num_rewards), reward.dtype),
         flags,
         flags,
         shape((), jnp.int32),

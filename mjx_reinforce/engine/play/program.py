@@ -11,7 +11,14 @@ import numpy as np
 from jax import lax
 
 from mjx_reinforce.engine import base, episode, objects, scalar
-from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, observation_size
+from mjx_reinforce.engine.base import (
+    Act,
+    Acts,
+    Environment,
+    PyTree,
+    observation_size,
+    term_names,
+)
 from mjx_reinforce.engine.checks import explain
 from mjx_reinforce.engine.cpu import handler, kernel, machine
 from mjx_reinforce.engine.cpu import seam as cpu_seam
@@ -47,7 +54,7 @@ class Carried(NamedTuple):
 class StepResult(NamedTuple):
     """What a step returns.
 
-    record: observation [O], action [A] or [], reward []
+    record: observation [O], action [A] or [], reward [], or with its K terms behind it [1 + K]
     alive: [] int32, 1 where the episode goes on
     broken: [] int32, 1 where it left the finite numbers
     carried: what the next step reads
@@ -73,6 +80,7 @@ def step_function(
     leaves, tree = jax.tree.flatten(base.shapes(env.reset, jax.random.key(0)))
     step_noise = jax.eval_shape(lambda: distribution.noise(jax.random.key(0), ()))
     words_per_step = int(np.prod(step_noise.shape, dtype=int))
+    terms = term_names(env)
 
     def step(actor, carry, t, deterministic, is_alive):
         """Plays one step of one episode, and draws no more noise than that takes."""
@@ -87,11 +95,15 @@ def step_function(
         offset = (chunk_step * words_per_step).astype(jnp.uint32)
         noise = distribution.noise(at_counter(keys[1], offset), ())
         step_result = episode.step(
-            env.step, act, distribution, actor, state, noise, is_alive, deterministic != 0
+            env.step, act, distribution, actor, state, noise, is_alive, deterministic != 0, terms
         )
         next_state = jax.tree.leaves(episode.hold(is_alive, step_result.state, state))
+        reward = step_result.reward
+        if terms:
+            term_rewards = [step_result.terms[name].astype(reward.dtype) for name in terms]
+            reward = jnp.stack([reward, *term_rewards])
         return StepResult(
-            record=[step_result.observation, step_result.action, step_result.reward],
+            record=[step_result.observation, step_result.action, reward],
             alive=step_result.alive.astype(jnp.int32),
             broken=step_result.broken.astype(jnp.int32),
             carried=Carried([stored(x) for x in next_state], keys),
@@ -124,10 +136,12 @@ class NativeProgram(NamedTuple):
 
     code: of ``seam.call`` on a CPU, of ``seam.launch`` on a GPU
     record: shape and dtype of the observation, the action and the reward of a step
+    terms: names of the reward's terms, which are recorded behind it
     """
 
     code: machine.Code | cubin.Kernel
     record: list[jax.ShapeDtypeStruct]
+    terms: tuple[str, ...]
 
 
 def build_program(
@@ -169,7 +183,7 @@ def build_program(
         functools.partial(team_kernel.player_text, num_actor=num_actor),
     )
     code, shapes = load("play", env, function, examples, writers, name_of(env))
-    return NativeProgram(code, shapes.record)
+    return NativeProgram(code, shapes.record, term_names(env))
 
 
 class Writers(NamedTuple):

@@ -1,7 +1,7 @@
 """Complete episodes under a policy, many at once."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from mjx_reinforce.engine import episode
-from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory
+from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory, term_names
 
 
 class _Progress(NamedTuple):
@@ -78,7 +78,8 @@ def vmap_rollout(
     modes = None
     if deterministic is not False:
         modes = jnp.broadcast_to(deterministic, num_episodes)
-    step = functools.partial(_step, env_step, act, distribution, actor, modes)
+    terms = term_names(env)
+    step = functools.partial(_step, env_step, act, distribution, actor, modes, terms)
     no_episode = jnp.zeros(num_episodes, bool)
     if limit is None:
         steps_left = None
@@ -88,7 +89,7 @@ def vmap_rollout(
         is_alive = active & (steps_left > 0)
     progress = _Progress(state, is_alive, nonfinite=no_episode, steps_left=steps_left)
     records = _empty_records(step, progress, distribution, horizon)
-    progress, (observation, action, reward, mask), simulated = episode.play_chunks(
+    progress, (observation, action, reward, mask, term_rewards), simulated = episode.play_chunks(
         lambda noise, progress: lax.scan(step, progress, noise),
         distribution,
         noise_keys,
@@ -102,6 +103,7 @@ def vmap_rollout(
         mask=mask,
         nonfinite=progress.nonfinite,
         simulated=simulated,
+        terms=term_rewards,
     )
 
 
@@ -111,20 +113,23 @@ def _step(
     distribution: Acts,
     actor: PyTree,
     deterministic: jax.Array | None,
+    terms: Sequence[str],
     progress: _Progress,
     noise: jax.Array,
-) -> tuple[_Progress, tuple[jax.Array, ...]]:
+) -> tuple[_Progress, tuple[Any, ...]]:
     """Plays one step of N episodes; for ``lax.scan`` over the noise [length, N, E].
 
     Returns:
-      The progress, and the records of the step: observation [O, N], action [N, A], reward [N] and
-      whether the episode was running before it [N].
+      The progress, and the records of the step: observation [O, N], action [N, A], reward [N],
+      whether the episode was running before it [N], and the reward's terms [N] by name.
     """
     state, is_alive, nonfinite, steps_left = progress
-    step = episode.step(env_step, act, distribution, actor, state, noise, is_alive, deterministic)
+    step = episode.step(
+        env_step, act, distribution, actor, state, noise, is_alive, deterministic, terms
+    )
     state = episode.hold(is_alive, step.state, state)
     # The mask is of the episodes that ran before the step: their last step counts.
-    record = (step.observation, step.action, step.reward, is_alive)
+    record = (step.observation, step.action, step.reward, is_alive, step.terms)
     is_alive = step.alive
     if steps_left is not None:
         steps_left = steps_left - 1

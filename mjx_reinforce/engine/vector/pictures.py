@@ -6,7 +6,8 @@ import os
 import sys
 import warnings
 import weakref
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -15,6 +16,26 @@ if TYPE_CHECKING:
 
 #: A floor's normal points upward by this much at least, [0, 1]: slopes of up to 60 degrees.
 _MIN_UPWARD = 0.5
+#: The length of an arrow of 1 m/s, its width, and how far it lies above the robot or another arrow,
+#: in radii of the robot.
+_ARROW_LENGTH = 1.5
+_ARROW_WIDTH = 0.04
+_ARROW_GAP = 0.3
+#: How far a camera is from the robot's center at least, in radii, to show the arrows.
+_CAMERA_DISTANCE = 5.0
+#: A slower robot (m/s) has no arrow: it would be a head without a shaft.
+_MIN_SPEED = 0.05
+
+
+class Arrow(NamedTuple):
+    """A velocity that is drawn above the robot.
+
+    velocity: [3] in the world (m/s)
+    color: red, green, blue, in [0, 255]
+    """
+
+    velocity: np.ndarray
+    color: tuple[int, int, int]
 
 
 class Renderer:
@@ -49,11 +70,12 @@ class Renderer:
         # Without this it closes itself when Python ends, too late for its own modules.
         self.close = weakref.finalize(self, self._renderer.close)
 
-    def draw(self, qpos: np.ndarray) -> np.ndarray:
+    def draw(self, qpos: np.ndarray, arrows: Sequence[Arrow] = ()) -> np.ndarray:
         """Returns a picture [height, width, 3] uint8.
 
         Args:
           qpos: [nq] generalized positions.
+          arrows: of a robot that goes, the lowest first.
         """
         mujoco = import_mujoco()
         model = self._model
@@ -67,10 +89,50 @@ class Renderer:
             # Where a sun is decides only how far its shadows reach.
             suns = model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
             data.light_xpos[suns, :2] += center[:2]
+            if len(arrows):
+                self._step_back(self._robot)
         # MuJoCo lays an endless floor around the camera of the scene before, which may be far away.
         mujoco.mjv_updateCamera(model, data, self._camera, self._renderer.scene)
         self._renderer.update_scene(data, self._camera)
+        if self._robot is not None and len(arrows):
+            self._lay_arrows(self._robot, arrows)
         return self._renderer.render()
+
+    def _radius(self, robot: int) -> float:
+        """Returns how far a robot's geoms reach from its center of mass at most (m)."""
+        model = self._model
+        geoms = model.body_rootid[model.geom_bodyid] == model.body_rootid[robot]
+        offsets = self._data.geom_xpos[geoms] - self._data.subtree_com[robot]
+        return float(np.max(np.linalg.norm(offsets, axis=1) + model.geom_rbound[geoms]))
+
+    def _step_back(self, robot: int) -> None:
+        """Moves a camera that is not the model's so far away that arrows are in the picture."""
+        # It never comes nearer again: the picture would sway with the robot's legs.
+        distance = _CAMERA_DISTANCE * self._radius(robot)
+        self._camera.distance = max(self._camera.distance, distance)
+
+    def _lay_arrows(self, robot: int, arrows: Sequence[Arrow]) -> None:
+        """Adds arrows to the scene, the lowest first, one above the other."""
+        mujoco = import_mujoco()
+        model = self._model
+        scene = self._renderer.scene
+        radius = self._radius(robot)
+        geoms = model.body_rootid[model.geom_bodyid] == model.body_rootid[robot]
+        start = self._data.subtree_com[robot].copy()
+        start[2] = np.max(self._data.geom_xpos[geoms, 2] + model.geom_rbound[geoms])
+        for arrow in arrows:
+            start[2] += _ARROW_GAP * radius
+            if np.linalg.norm(arrow.velocity) < _MIN_SPEED:
+                continue
+            geom = scene.geoms[scene.ngeom]
+            rgba = np.array([*arrow.color, 255], np.float32) / 255
+            kind = mujoco.mjtGeom.mjGEOM_ARROW
+            mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), rgba)
+            end = start + _ARROW_LENGTH * radius * arrow.velocity
+            mujoco.mjv_connector(geom, kind, _ARROW_WIDTH * radius, start, end)
+            # Hardly shaded, so that its color is that of its name below the picture.
+            geom.emission = 0.3
+            scene.ngeom += 1
 
 
 def _traveler(model: "MjModel") -> int | None:

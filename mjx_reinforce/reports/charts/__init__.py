@@ -229,18 +229,20 @@ def shown_rows(data: str, *transforms: Spec) -> Spec:
     return {"data": {"name": data}, "transform": [*filters, *transforms]}
 
 
-def series(labels: Sequence[str], *, legend: bool = True) -> Spec:
-    """Returns the colors of configurations."""
-    return _by_place(labels, [color(i) for i in range(len(labels))], legend=legend)
+def series(labels: Sequence[str], field: str = "configuration", *, legend: bool = True) -> Spec:
+    """Returns the colors of configurations, or of what else a field has."""
+    return _by_place(field, labels, [color(i) for i in range(len(labels))], legend=legend)
 
 
-def dashes(labels: Sequence[str]) -> Spec:
-    """Returns the dashes of configurations."""
-    return _by_place(labels, [dash(i) for i in range(len(labels))])
+def dashes(labels: Sequence[str], field: str = "configuration") -> Spec:
+    """Returns the dashes of configurations, or of what else a field has."""
+    return _by_place(field, labels, [dash(i) for i in range(len(labels))])
 
 
-def _by_place(labels: Sequence[str], looks: Sequence[Any], *, legend: bool = True) -> Spec:
-    """Returns how configurations look, each by its place, and a legend of several.
+def _by_place(
+    field: str, labels: Sequence[str], looks: Sequence[Any], *, legend: bool = True
+) -> Spec:
+    """Returns how a field's labels look, each by its place, and a legend of several.
 
     It has as many columns as the page has room for. Not as the chart has: that is narrowed to leave
     room for the axis once the legend is laid out.
@@ -251,10 +253,12 @@ def _by_place(labels: Sequence[str], looks: Sequence[Any], *, legend: bool = Tru
         column_width = min(7 * max(map(len, labels)), CONFIG["legend"]["labelLimit"]) + 50
         num_columns = f"max(1, floor((width && containerSize()[0] || width) / {column_width}))"
         legend_spec = {"title": None, "orient": "top", "direction": "horizontal", "offset": 36}
-        legend_spec |= {"columns": {"expr": num_columns}, "values": {"expr": "shown"}}
+        legend_spec |= {"columns": {"expr": num_columns}}
+        if field == "configuration":
+            legend_spec |= {"values": {"expr": "shown"}}
         legend_spec |= {"symbolType": "stroke", "symbolOpacity": 1, "labelFontSize": 12}
     scale = {"domain": list(labels), "range": list(looks)}
-    return {**_CONFIGURATION, "scale": scale, "legend": legend_spec}
+    return {"field": field, "type": "nominal", "scale": scale, "legend": legend_spec}
 
 
 def moment_line(findings: Findings) -> Spec:

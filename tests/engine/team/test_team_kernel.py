@@ -165,6 +165,10 @@ def test_teams_play_the_same_episodes(teams, name):
     for name in ("observation", "action", "reward"):
         pair = (getattr(x, name)[:, :first] for x in (got, want))
         np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
+    assert len(got.terms) > 2
+    for name, term in got.terms.items():
+        pair = (x[:, :first] for x in (term, want.terms[name]))
+        np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
     assert np.abs(got.mask.sum(1) - want.mask.sum(1)).max() <= 3
     np.testing.assert_array_equal(got.simulated, got.mask.sum((1, 2)))
 
