@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.checks import require
@@ -40,8 +40,8 @@ def push(key: jax.Array, speed: ArrayLike, is_due: ArrayLike) -> jax.Array:
       speed: [] the most in each direction (m/s).
       is_due: [] whether there is a push; else the change is 0.
     """
-    change = speed * jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)
-    return jnp.where(is_due, change, 0.0)
+    change = jnp.asarray(speed, float) * jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)
+    return jnp.where(jnp.asarray(is_due), change, 0.0)
 
 
 def push_velocity(model: MjModel, push: jax.Array) -> jax.Array:

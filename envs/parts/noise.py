@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 
 def uniform_noise(key: jax.Array, half_width: ArrayLike) -> jax.Array:

@@ -21,6 +21,7 @@ import tyro
 
 from mjx_reinforce import load, make_vec
 from mjx_reinforce.export.run_files import read_run
+from mjx_reinforce.files import read_json
 
 #: The terms of the reward that are errors, and their units.
 ERRORS = {"forward_error": "m/s", "sideways_error": "m/s", "turn_error": "rad/s"}
@@ -75,12 +76,10 @@ def main() -> None:
     """Prints a row for each seed of a run."""
     settings = tyro.cli(TrackingSettings, description=__doc__)
     sys.path.insert(0, "")
-    config = read_run(settings.run).config
-    module, _, name = config.env.partition(":")
+    run = read_run(settings.run)
+    module, _, name = run.env.partition(":")
     task = getattr(importlib.import_module(module), name)
-    seeds = range(config.num_seeds)
-    if config.seeds:
-        seeds = range(*map(int, config.seeds.split(":")))
+    seeds = run.seeds or range(read_json(settings.run / "config.json")["num_seeds"])
     print("| seed | " + " | ".join(f"{name} ({unit})" for name, unit in ERRORS.items()), end="")
     print(" | did not fall |\n|---|---|---|---|---|")
     for seed in seeds:
