@@ -11,11 +11,11 @@ from mjx_reinforce.envs import refusals
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco
-#: Feet end at most this part of the robot's height above the lowest one. Of 60 robots on legs in
-#: Menagerie and Playground, no foot was above 1%, and what is no foot was at 2% or more.
+#: Feet end at most this part of the robot's height above the lowest one. In 18 scenes of Menagerie
+#: with robots on legs, feet were at 0.3% at most, and what is no foot at 2.2% or more.
 _TOLERANCE = 0.015
-#: Legs keep the trunk so high over the feet, as a part of that height. It is 0.45 or more in those
-#: robots, and less than 0.39 in cars, who lies, and Gymnasium's ants, whose legs are level.
+#: Legs keep the trunk so high over the feet, as a part of that height. It is 0.45 or more of robots
+#: on legs, and less than 0.39 of cars, what lies, and Gymnasium's ants, whose legs are level.
 _CLEARANCE = 0.4
 #: The least cosine between the normal of a floor and the vertical.
 _LEVEL = 0.9
