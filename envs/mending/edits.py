@@ -149,9 +149,9 @@ def _feet_alone(spec: Any, model: MjModel) -> Iterator[str]:
     for number, element in _by_number(spec.pairs).items():
         if number not in kept_pairs:
             spec.delete(element)
-    count = f"{len(stance.pairs):,} possible contacts in place of {num_pairs:,}"
+    count = f"possible contacts {len(stance.pairs):,} in place of {num_pairs:,}"
     feet = ", ".join(refusals.geom_name(model, foot) for foot in stance.feet)
-    yield f"only the feet collide ({feet}): {count}"
+    yield f"only the feet collide ({feet}), {count}"
 
 
 def _refused_contacts(spec: Any, model: MjModel) -> Iterator[str]:

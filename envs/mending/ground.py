@@ -11,9 +11,12 @@ from mjx_reinforce.envs import refusals
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco
-#: Feet end at most this part of the robot's height above the lowest one. Of 60 robots on legs in
-#: Menagerie and Playground, no foot was above 1%, and what is no foot was at 2% or more.
+#: Feet end at most this part of the robot's height above the lowest one. In 18 scenes of Menagerie
+#: with robots on legs, feet were at 0.3% at most, and what is no foot at 2.2% or more.
 _TOLERANCE = 0.015
+#: Legs keep the trunk so high over the feet, as a part of that height. It is 0.45 or more of robots
+#: on legs, and less than 0.39 of cars, what lies, and Gymnasium's ants, whose legs are level.
+_CLEARANCE = 0.4
 #: The least cosine between the normal of a floor and the vertical.
 _LEVEL = 0.9
 #: How far ``mj_geomDistance`` looks (m).
@@ -81,7 +84,11 @@ def first_pose(model: MjModel) -> Any:
 
 
 def stance(model: MjModel) -> Stance | None:
-    """Returns on what a robot with a free joint stands; None without one robot and a floor."""
+    """Returns on what a robot on legs stands in its first pose.
+
+    Returns:
+      None where that is not one robot with a free joint, over a floor, whose trunk is off it.
+    """
     if model.ntree != 1 or model.jnt_type[0] != _C.mjtJoint.mjJNT_FREE:
         return None
     data = first_pose(model)
@@ -96,6 +103,9 @@ def stance(model: MjModel) -> Stance | None:
     if not gaps:
         return None
     lowest, highest = min(gaps.values()), max(gaps.values())
+    trunk = [gap for geom, gap in gaps.items() if model.geom_bodyid[geom] == model.jnt_bodyid[0]]
+    if min(trunk, default=highest) < lowest + _CLEARANCE * (highest - lowest):
+        return None
     limit = lowest + _TOLERANCE * (highest - lowest)
     feet = sorted(geom for geom, gap in gaps.items() if gap <= limit)
     of_feet = [

@@ -43,7 +43,7 @@ def test_only_the_feet_collide():
     after = mended.spec.compile()
     assert mended.edits == [
         'cone="pyramidal" in place of elliptic',
-        "only the feet collide (front_foot, hind_foot): 4 possible contacts in place of 25",
+        "only the feet collide (front_foot, hind_foot), possible contacts 4 in place of 25",
     ]
     assert refusals.best_in_c(after) is None
     names = {(after.geom(one).name, after.geom(two).name) for one, two, _ in ground.pairs(after)}
@@ -55,6 +55,19 @@ def test_only_the_feet_collide():
         *("floor", "front_foot", "hind_foot")
     }
     assert edits.mend(mended.spec).edits == []
+
+
+def test_what_lies_on_its_trunk_has_no_feet():
+    """As Gymnasium's ant, whose legs are level; its trunk goes on to collide."""
+    spec = robot(BALL)
+    for geom in spec.geoms:
+        if geom.name.endswith("_foot"):
+            geom.pos = [0.3, 0, 0]
+        if geom.type == C.mjtGeom.mjGEOM_CAPSULE:
+            geom.fromto = [0, 0, 0, 0.2, 0, 0]
+    model = spec.compile()
+    assert ground.stance(model) is None
+    assert not any("feet" in edit for edit in edits.mend(spec).edits)
 
 
 def test_possible_contacts_are_those_of_c():
