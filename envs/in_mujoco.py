@@ -142,6 +142,7 @@ class InMujoco:
         return observed(self.env, data), recollection
 
     def _outcome(self, before, fields, episode, recollection, last_frames, action):
+        """Returns the observation, the outcome, and what the episode then remembers."""
         data = self._view(fields, episode)
         next_recollection = recollect_step(self.env, recollection, data, action)
         before = self._view(before, episode, recollection)

@@ -41,6 +41,7 @@ ORDER = [
     "sweep",
     "train",
     "watch",
+    "templates",
     "new",
     "__main__",
 ]
@@ -69,7 +70,7 @@ COMMANDS = {"envs.__main__", "export.__main__"}
 #: Who may know that our environments exist; all others take any environment as an argument.
 MAY_IMPORT_ENVS = {
     *("envs", "settings", "training", "setup", "runs", "playing"),
-    *("gym", "train", "watch", "new", "__main__"),
+    *("gym", "train", "watch", "templates", "new", "__main__"),
 }
 
 #: What a user writes, and what the checker is asked; its last line is wrong.
