@@ -28,8 +28,8 @@ def affine_control(env: Environment) -> Arrays:
       task with a gait also ``gait`` [P, A].
 
     Raises:
-      ValueError: the task has no ``control``, or ``control`` computes something else, or its gait is no
-        table of finite numbers.
+      ValueError: the task has no ``control``, ``control`` computes something else, or the gait is
+        no table of finite numbers.
     """
     task: Any = env
     while not hasattr(task, "control") and hasattr(task, "env"):

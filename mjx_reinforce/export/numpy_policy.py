@@ -68,5 +68,5 @@ def numpy_policy(arithmetic: Arithmetic, name: str, env: str, seed: int) -> tupl
 
 
 def _text(part: str) -> str:
-    """Returns what a module has more, where the policy sees several frames, or there is a control."""
+    """Returns what a module has more, if the policy sees several frames, or there is a control."""
     return Path(__file__).with_name(f"numpy_policy_{part}.txt").read_text("utf-8")

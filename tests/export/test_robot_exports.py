@@ -2,6 +2,7 @@
 
 import sys
 from types import SimpleNamespace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -191,7 +192,7 @@ def test_the_control_of_the_task_comes_into_the_files(tmp_path, monkeypatch):
 
 def walks(actions, steps):
     """Returns what the task applies of actions at env steps, clamped as by MuJoCo."""
-    task = envs.make("servos_of_test:Walker")
+    task: Any = envs.make("servos_of_test:Walker")
     befores = [SimpleNamespace(memory={"step": step}) for step in steps]
     applied = [
         task.actuate(before, jnp.asarray(action))
