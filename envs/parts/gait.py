@@ -26,7 +26,7 @@ class Foot(NamedTuple):
     """The end of a limb on which a robot stands.
 
     geom: its number in the model
-    joints: the numbers of the hinges and slides between the root and it
+    joints: the numbers of the hinges and slides of the limb, from the root on
     position: [3] the center of the geom in the first pose (m)
     """
 
@@ -39,17 +39,20 @@ def feet(model: MjModel) -> list[Foot]:
     """Returns the feet in their order around the robot, from behind on, seen from above.
 
     They are the geoms that come nearest the floor in the first key frame, or in the model's pose
-    where there is none; of each limb, which its first joint tells from others, one.
+    where there is none; of each limb, which its first joint tells from others, one. A joint that
+    all feet hang on, such as a waist, is of no limb.
     """
     standing = stance(model)
     if standing is None:
         return []
     data = first_pose(model)
     limbs: dict[int, Foot] = {}
-    for geom in standing.feet:
-        joints = _joints_to(model, model.geom_bodyid[geom])
-        if joints:
-            limbs.setdefault(joints[0], Foot(geom, joints, data.geom_xpos[geom].copy()))
+    paths = {geom: _joints_to(model, model.geom_bodyid[geom]) for geom in standing.feet}
+    paths = {geom: path for geom, path in paths.items() if path}
+    num_shared = _num_shared([*paths.values()])
+    for geom, path in paths.items():
+        joints = path[num_shared:]
+        limbs.setdefault(joints[0], Foot(geom, joints, data.geom_xpos[geom].copy()))
     middle = np.mean([foot.position for foot in limbs.values()] or np.zeros((1, 3)), axis=0)
 
     def direction(foot: Foot) -> float:
@@ -111,6 +114,13 @@ def _joints_to(model: MjModel, body: int) -> tuple[int, ...]:
         body = model.body_parentid[body]
     scalar = (int(_C.mjtJoint.mjJNT_HINGE), int(_C.mjtJoint.mjJNT_SLIDE))
     return tuple(int(joint) for joint in reversed(joints) if model.jnt_type[joint] in scalar)
+
+
+def _num_shared(paths: list[tuple[int, ...]]) -> int:
+    """Returns how many joints all paths begin with; each keeps one or more after them."""
+    shortest = min(map(len, paths), default=1) - 1
+    is_shared = [len(set(joints)) == 1 for joints in zip(*paths, strict=False)]
+    return [*is_shared[:shortest], False].index(False)
 
 
 def _lift(model: MjModel, foot: Foot, height: float) -> np.ndarray:

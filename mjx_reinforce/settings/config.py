@@ -145,6 +145,11 @@ def check_each(config: Config) -> None:
     # Before hours of training, and not where the first row is logged.
     for name in config.log:
         _check_installed(name)
+    if not config.env:
+        raise ValueError(
+            "no environment is named: add --env, such as --env my_robot:MyRobot for the class "
+            "MyRobot in my_robot.py"
+        )
     envs.check_id(config.env)
     split_words(config.env_set)
     choices = {

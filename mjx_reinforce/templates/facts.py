@@ -1,7 +1,10 @@
 """What the text of a class says of a model."""
 
 import json
+import keyword
+import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,8 +14,21 @@ if TYPE_CHECKING:
 
 
 def class_name(module: str) -> str:
-    """Returns the name of the class in a module: my_arm -> MyArm."""
-    return "".join(word[:1].upper() + word[1:] for word in module.split("_"))
+    """Returns the name of the class in a module: my_arm -> MyArm, and box -> TaskBox.
+
+    The class must not hide what the templates import or define, as they do ``Box``.
+    """
+    name = "".join(word[:1].upper() + word[1:] for word in module.split("_"))
+    is_name = name.isidentifier() and not keyword.iskeyword(name)
+    texts = (file.read_text("utf-8") for file in Path(__file__).parent.glob("*.txt"))
+    is_taken = any(re.search(rf"\b{name}\b", text) for text in texts)
+    return name if is_name and not is_taken else f"Task{name}"
+
+
+def quoted(name: str) -> str:
+    """Returns a name of a model as Python writes it in double quotes, on one line."""
+    # JSON's own escapes of what is beyond 16 bits are two characters in Python.
+    return json.dumps(name, ensure_ascii=False)
 
 
 def action_lines(model: "MjModel", array: str) -> Iterator[str]:
@@ -26,8 +42,7 @@ def action_lines(model: "MjModel", array: str) -> Iterator[str]:
         # An actuator without a name goes by the joint that it moves, where it moves one (type 0).
         if not name and model.actuator_trntype[i] == 0:
             name = model.joint(model.actuator_trnid[i, 0]).name
-        name = json.dumps(name)
-        yield f"    {array}[{i}]: actuator {name}{limits}"
+        yield f"    {array}[{i}]: actuator {quoted(name)}{limits}"
 
 
 def has_servos(model: "MjModel") -> bool:
@@ -44,7 +59,10 @@ def has_servos(model: "MjModel") -> bool:
     is_affine = model.actuator_biastype == c.mjtBias.mjBIAS_AFFINE
     is_pulled = model.actuator_biasprm[:, 1] == -model.actuator_gainprm[:, 0]
     is_direct = model.actuator_gear[:, 0] == 1
-    return bool((is_scalar & is_affine & is_pulled & is_direct).all())
+    # Of an integrator, as <intvelocity> has one, the control is a speed.
+    lags = (c.mjtDyn.mjDYN_NONE, c.mjtDyn.mjDYN_FILTER, c.mjtDyn.mjDYN_FILTEREXACT)
+    is_position = np.isin(model.actuator_dyntype, lags)
+    return bool((is_scalar & is_affine & is_pulled & is_direct & is_position).all())
 
 
 def direction_up(model: "MjModel") -> list[float]:

@@ -1,6 +1,5 @@
 """The class of a robot on legs, which walks as it is commanded."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -58,21 +57,24 @@ _START = """\
         joints = self.mj_model.jnt_qposadr[self.mj_model.actuator_trnid[:, 0]]
         noise = jax.random.uniform(rng, ({nu},), minval=-0.1, maxval=0.1)
         qpos = jnp.asarray({pose}).at[joints].add(noise)
-        return {{"qpos": qpos, "ctrl": jnp.asarray(self.home)}}"""
+        return {{"qpos": qpos, {controls}}}"""
+_CONTROLS = '"ctrl": jnp.asarray(self.home)'
+#: Servos that lag have reached their controls.
+_ACTIVATIONS = ', "act": jnp.asarray(self.home)'
 
 
 def is_legged(model: "MjModel") -> bool:
-    """Returns whether a model is a robot that stands on its feet, with servos in all joints.
+    """Returns whether a model is a robot that stands on its feet, and is moved by servos alone.
 
-    Its body, which is to be upright, and the joints of its servos have names.
+    Its body, which is to be upright, has a name; the joints of servos always have.
     """
     from mjx_reinforce.envs.parts import feet
 
     is_free = bool(model.njnt > 0 and model.jnt_type[0] == 0)
-    if not is_free or not facts.has_servos(model) or len(feet(model)) < 2:
+    if not is_free or not _body(model) or not facts.has_servos(model) or len(feet(model)) < 2:
         return False
-    names = [_body(model), *_joints(model)]
-    return all(names) and np.allclose(facts.direction_up(model), [0, 0, 1], atol=0.1)
+    lag_alike = model.na in (0, model.nu)
+    return lag_alike and np.allclose(facts.direction_up(model), [0, 0, 1], atol=0.1)
 
 
 def class_source(model: "MjModel", xml: str, module: str) -> str:
@@ -92,6 +94,7 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
     home = _HOME_OF_JOINTS.format(pose=pose)
     if model.nkey and model.key_ctrl[0].any():
         home = _HOME_OF_CONTROLS
+    controls = _CONTROLS + _ACTIVATIONS * (model.na > 0)
     limit = _limit(model)
     if limit is not None:
         home += _LIMIT.format(limit=limit)
@@ -102,9 +105,9 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
         .format(
             title=facts.class_name(module),
             module=module,
-            xml=json.dumps(xml),
-            body=json.dumps(_body(model)),
-            joints="\n".join(f"    {json.dumps(name)}," for name in _joints(model)),
+            xml=facts.quoted(xml),
+            body=facts.quoted(_body(model)),
+            joints="\n".join(f"    {facts.quoted(name)}," for name in _joints(model)),
             frame_skip=frame_skip,
             timestep=timestep,
             period=period,
@@ -117,10 +120,10 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
             turn=pace.turn,
             push=pace.push,
             lift=round(min(pace.lift * height, _HIGHEST_LIFT), 3),
-            lowest=round(_LOWEST * height, 3),
+            lowest=round(_floor(model) + _LOWEST * height, 3),
             nu=model.nu,
             home=home,
-            start=_START.format(nu=model.nu, pose=pose),
+            start=_START.format(nu=model.nu, pose=pose, controls=controls),
             effort_weight='    "effort": -0.1,\n' if limit else "",
             effort_term=_effort(limit),
         )
@@ -160,7 +163,17 @@ def _joints(model: "MjModel") -> Iterator[str]:
 def _height(model: "MjModel") -> float:
     """Returns the height of the body over the floor in the first pose (m)."""
     pose: Any = model.key_qpos[0] if model.nkey else model.qpos0
-    return float(pose[2])
+    return float(pose[2]) - _floor(model)
+
+
+def _floor(model: "MjModel") -> float:
+    """Returns the height of the floor under the feet (m)."""
+    from mjx_reinforce.envs.mending import ground
+
+    standing: Any = ground.stance(model)
+    geoms = [geom for pair in standing.pairs for geom in pair[:2]]
+    planes = [geom for geom in geoms if model.geom_type[geom] == 0]
+    return float(ground.first_pose(model).geom_xpos[planes, 2].min())
 
 
 def _limit(model: "MjModel") -> str | None:

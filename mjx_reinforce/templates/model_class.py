@@ -1,6 +1,5 @@
 """The text of a task's class, written from a MuJoCo model."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -71,7 +70,7 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
     return template.format(
         title=facts.class_name(module),
         module=module,
-        xml=json.dumps(xml),
+        xml=facts.quoted(xml),
         frame_skip=frame_skip,
         timestep=timestep,
         steps=num_steps,
@@ -90,7 +89,7 @@ def _observation(model: "MjModel", is_free: bool) -> Iterator[str]:
         yield "qpos[2:7]"
     joints = [model.joint(i).name for i in range(int(is_free), model.njnt)]
     if all(joints):
-        yield from (f"joint({json.dumps(name)}).qpos" for name in joints)
+        yield from (f"joint({facts.quoted(name)}).qpos" for name in joints)
     else:
         yield "qpos[7:]" if is_free else "qpos"
     yield "qvel"
@@ -116,7 +115,8 @@ def _start_and_home(model: "MjModel", is_free: bool) -> dict[str, Any]:
     ctrl = ""
     if has_servos and not has_controls:
         ctrl = ', "ctrl": self.home'
-    key = json.dumps(model.key(0).name or 0)
+    name = model.key(0).name
+    key = facts.quoted(name) if name else "0"
     placeholders["start"] = _KEY_FRAME.format(key=key, ctrl=ctrl)
     if has_controls or has_servos:
         home = _HOME_OF_CONTROLS if has_controls else _HOME_OF_SERVOS

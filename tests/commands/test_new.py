@@ -10,10 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from new_classes import lint, write
 from places import ROOT
 
 import mjx_reinforce as mr
-from mjx_reinforce import envs, new
+from mjx_reinforce import envs
 from mjx_reinforce.engine import choose
 from mjx_reinforce.envs.refusals import best_in_c
 
@@ -47,17 +48,6 @@ def test_the_arm_is_paid_for_the_distance_of_the_ball(monkeypatch):
     np.testing.assert_allclose(state.obs[-3:], np.array([0.3, 0.0, 0.2]) - tip, atol=1e-6)
     starts = jax.vmap(env.initial)(jax.random.split(jax.random.key(1), 100))[0]
     assert np.all(np.linalg.norm(starts[:, 3:], axis=1) < 0.75)  # within reach
-
-
-def lint(file):
-    for check in (["check", "--select", "E,F,W"], ["format", "--check"]):
-        options = ["--isolated", "--line-length", "100", file]
-        subprocess.run([sys.executable, "-m", "ruff", *check, *options], check=True)
-
-
-def write(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["new", *arguments])
-    new.main()
 
 
 def test_a_model_becomes_a_class_that_plays(tmp_path, monkeypatch, capsys):

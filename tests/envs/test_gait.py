@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from on_legs import on_legs
 from places import ROOT
 
 from mjx_reinforce.envs import parts
@@ -21,32 +22,6 @@ def quadruped():
     return mujoco.MjModel.from_xml_path(str(QUADRUPED))
 
 
-def robot(num_legs):
-    """Returns a body on legs in a circle, each of which swings, folds and turns out."""
-    legs = "".join(
-        f"""
-        <body euler="0 0 {360 * leg / num_legs + 10}"><body pos="0.3 0 0">
-          <joint name="out{leg}" axis="1 0 0"/><geom size="0.03" contype="0" conaffinity="0"/>
-          <body euler="0 30 0"><joint name="swing{leg}" axis="0 1 0"/>
-            <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02" contype="0" conaffinity="0"/>
-            <body pos="0 0 -0.2" euler="0 -60 0"><joint name="knee{leg}" axis="0 1 0"/>
-              <geom name="shin{leg}" size="0.02" pos="0 0 -0.1"/>
-              <geom name="foot{leg}" size="0.02" pos="0 0 -0.2"/>
-        </body></body></body></body>"""
-        for leg in range(num_legs)
-    )
-    servos = "".join(
-        f'<position joint="{name}{leg}"/>'
-        for name in ("knee", "out", "swing")
-        for leg in range(num_legs)
-    )
-    return mujoco.MjModel.from_xml_string(
-        f"""<mujoco><worldbody><geom type="plane" size="0 0 1"/><body name="trunk" pos="0 0 0.37">
-        <freejoint/><geom size="0.05" mass="5"/>{legs}</body></worldbody>
-        <actuator>{servos}</actuator></mujoco>"""
-    )
-
-
 def foot_positions(model, geoms, controls):
     """Returns where geoms are [N, 3] when the servos' joints are where the controls say."""
     data = mujoco.MjData(model)
@@ -58,7 +33,7 @@ def foot_positions(model, geoms, controls):
 
 @pytest.mark.parametrize("num_legs", [2, 4, 6])
 def test_feet_are_lifted_straight_up_and_neighbors_in_turn(num_legs):
-    model = robot(num_legs)
+    model = mujoco.MjModel.from_xml_string(on_legs(num_legs))
     feet = parts.feet(model)
     names = {model.geom(foot.geom).name for foot in feet}
     assert names == {f"foot{leg}" for leg in range(num_legs)}
@@ -82,6 +57,21 @@ def test_a_quadruped_trots(quadruped):
     sides = [tuple(np.sign(foot.position[:2])) for foot in feet]
     assert sides[::2] in ([(-1, -1), (1, 1)], [(1, -1), (-1, 1)])
     assert all(len(foot.joints) == 3 for foot in feet)
+
+
+def test_legs_that_hang_on_one_waist_are_two():
+    waist = '<body><joint name="waist" axis="0 0 1"/><geom size="0.03"/>'
+    text = on_legs(2).replace('mass="5"/>', f'mass="5"/>{waist}')
+    text = text.replace("</body></worldbody>", "</body></body></worldbody>")
+    text = text.replace("<actuator>", '<actuator><position joint="waist"/>')
+    model = mujoco.MjModel.from_xml_string(text)
+    feet = parts.feet(model)
+    assert [model.geom(foot.geom).name for foot in feet] == ["foot1", "foot0"]
+    names = [[model.joint(joint).name for joint in foot.joints] for foot in feet]
+    assert names == [["out1", "swing1", "knee1"], ["out0", "swing0", "knee0"]]
+    gait = parts.gait(model, HEIGHT, PERIOD)
+    assert not gait[:, 0].any()
+    assert np.all(gait[:, 1:].any(axis=0))
 
 
 def test_a_foot_that_only_a_pair_lets_touch_is_one(quadruped):

@@ -51,11 +51,13 @@ def test_a_preset_trains(name, run, tmp_path):
 def test_every_preset_makes_sense():
     """Its update is traced, not compiled."""
     for name, (line, config) in PRESETS.items():
+        arguments = [name, "--horizon", "7"]
+        if not config.env:
+            config = dataclasses.replace(config, env="InvertedPendulum-v5")
+            arguments += ["--env", config.env]
         check(config)
         assert 20 < len(line) < 100
-        assert command_line.parse([name, "--horizon", "7"]).base == dataclasses.replace(
-            config, horizon=7
-        )
+        assert command_line.parse(arguments).base == dataclasses.replace(config, horizon=7)
         small = dataclasses.replace(config, num_seeds=1, horizon=7, engine="vmap")
         learner = build(envs.make(config.env), small).learner
         before = jax.eval_shape(learner.init, jax.random.key(0))
