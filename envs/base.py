@@ -115,6 +115,9 @@ class MujocoEnv(Env):
     #: How many observations a policy sees: the last ones, the oldest first, one after the other. At
     #: the start of an episode all are the first. A policy that runs elsewhere keeps them itself.
     frames: int = 1
+    #: What ``actuate`` adds to the controls at each env step of a period [P, nu], if it does that:
+    #: files of ``export --env`` add it, too. ``parts.gait`` makes one, ``parts.cyclic`` reads it.
+    gait: np.ndarray | None = None
 
     def __init__(self, **arguments: object):
         """Compiles the model.

@@ -27,7 +27,7 @@ class ExportSettings:
     """
     env: str | None = None
     """The task that the run was trained on, module:Class if it is your own. Its code runs, and what
-    it applies of an action, home + scale * action, comes into the files."""
+    it applies of an action, home + scale * action and its gait, comes into the files."""
     overwrite: bool = False
     """Replace files that exist."""
 

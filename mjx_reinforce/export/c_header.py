@@ -29,7 +29,7 @@ def c_header(arithmetic: Arithmetic, name: str, run: str, env: str, seed: int) -
     # A row is the bias of a unit and its weights, in the order in which the function reads them.
     units = [np.concatenate([bias[:, None], weight.T], axis=1).ravel() for weight, bias in layers]
     arrays = arithmetic.scale | {"network": np.concatenate(units)} | arithmetic.bounds
-    arrays |= arithmetic.control
+    arrays |= {key: array.ravel() for key, array in arithmetic.control.items()}
     scaled = "observation[i]" if arithmetic.frames == 1 else "state->frames[i]"
     if arithmetic.scale:
         deviations = f"({scaled} - {name}_mean[i]) / {name}_std[i]"
@@ -43,6 +43,9 @@ def c_header(arithmetic: Arithmetic, name: str, run: str, env: str, seed: int) -
         parts |= _remembering(name, arithmetic.frames, parts)
     if arithmetic.control:
         parts["control"] = _filled("c_header_control.txt", name)
+    if "gait" in arithmetic.control:
+        period = len(arithmetic.control["gait"])
+        parts["control"] = _filled("c_header_gait.txt", name, period=period)
     return _filled(
         "c_header.txt",
         name,

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.engine.base import Environment
+from mjx_reinforce.engine.checks import require
 from mjx_reinforce.files import Arrays
 
 #: At how many random actions the numbers are checked, and to which part of the largest number.
@@ -17,14 +18,18 @@ _TOLERANCE = 1e-7
 def affine_control(env: Environment) -> Arrays:
     """Returns the numbers of a task's ``control``: home + scale * action, in the actuators' ranges.
 
+    Where the task has a ``gait``, it is added before the sum is clipped.
+
     Args:
       env: a ``MujocoEnv``, or a wrapper of one.
 
     Returns:
-      ``home``, ``scale``, ``ctrl_low`` and ``ctrl_high`` [A], float32; bounds may be infinite.
+      ``home``, ``scale``, ``ctrl_low`` and ``ctrl_high`` [A], float32; bounds may be infinite. Of a
+      task with a gait also ``gait`` [P, A].
 
     Raises:
-      ValueError: the task has no ``control``, or ``control`` computes something else.
+      ValueError: the task has no ``control``, ``control`` computes something else, or the gait is
+        no table of finite numbers.
     """
     task: Any = env
     while not hasattr(task, "control") and hasattr(task, "env"):
@@ -56,7 +61,21 @@ def affine_control(env: Environment) -> Arrays:
         [-np.inf, np.inf],
     )
     arrays = {"home": home, "scale": scale, "ctrl_low": bounds[:, 0], "ctrl_high": bounds[:, 1]}
+    if task.gait is not None:
+        arrays["gait"] = _gait(task, len(home))
     return {name: array.astype(np.float32) for name, array in arrays.items()}
+
+
+def _gait(task: Any, num_controls: int) -> np.ndarray:
+    """Returns the gait [P, A] of a task, or raises ValueError where it is no such table."""
+    gait = np.asarray(task.gait)
+    is_table = gait.ndim == 2 and len(gait) > 0 and gait.shape[1] == num_controls
+    require(
+        is_table and gait.dtype.kind in "iuf" and bool(np.isfinite(gait).all()),
+        f"gait of {type(task).__name__} is what actuate adds to the controls at each env step of a "
+        f"period: finite numbers [P, {num_controls}], got {gait.dtype}{list(gait.shape)}",
+    )
+    return gait
 
 
 def _control(task: Any, action: np.ndarray) -> np.ndarray:

@@ -55,7 +55,9 @@ def numpy_policy(arithmetic: Arithmetic, name: str, env: str, seed: int) -> tupl
             "acting": "policy",
             "further": _text("frames").format(size=inputs, number=arithmetic.frames),
         }
-    if arithmetic.control:
+    if "gait" in arithmetic.control:
+        placeholders["further"] += _text("gait")
+    elif arithmetic.control:
         placeholders["further"] += _text("control")
     template = Path(__file__).with_name("numpy_policy.txt").read_text("utf-8")
     body = "\n    ".join(lines)
@@ -66,5 +68,5 @@ def numpy_policy(arithmetic: Arithmetic, name: str, env: str, seed: int) -> tupl
 
 
 def _text(part: str) -> str:
-    """Returns what a module has more, where the policy sees several frames, or has a control."""
+    """Returns what a module has more, if the policy sees several frames, or there is a control."""
     return Path(__file__).with_name(f"numpy_policy_{part}.txt").read_text("utf-8")

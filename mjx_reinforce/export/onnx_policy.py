@@ -45,6 +45,7 @@ def onnx_policy(arithmetic: Arithmetic, run: str, env: str, seed: int) -> bytes:
     Its inputs are ``observation`` [N, O] and, of a policy that sees several, ``frames`` [N, F*O]:
     what ``next_frames`` was one step before, and at the start of an episode the first observation F
     times. The output is ``action`` [N, A], or [N] if discrete; with a control also ``ctrl`` [N, A].
+    With a gait there is an input ``step`` [N], too: the env steps in which ``ctrl`` is applied.
 
     Args:
       arithmetic: of one seed's policy.
@@ -62,7 +63,7 @@ def onnx_policy(arithmetic: Arithmetic, run: str, env: str, seed: int) -> bytes:
     graph = _Nodes(onnx)
     num_inputs = len(arithmetic.layers[0][0])
     size = num_inputs // arithmetic.frames
-    inputs = {"observation": ["N", size]}
+    inputs: dict[str, Sequence[str | int]] = {"observation": ["N", size]}
     outputs: dict[str, Sequence[str | int]] = {"action": ["N", len(arithmetic.layers[-1][1])]}
     observation = "observation"
     if arithmetic.frames > 1:
@@ -76,18 +77,17 @@ def onnx_policy(arithmetic: Arithmetic, run: str, env: str, seed: int) -> bytes:
     if control:
         outputs["ctrl"] = ["N", len(control["home"])]
         moved = graph.add("Add", graph.add("Mul", "action", control["scale"]), control["home"])
+        if "gait" in control:
+            inputs["step"] = ["N"]
+            phase = graph.add("Mod", "step", np.array(len(control["gait"])))
+            moved = graph.add("Add", moved, graph.add("Gather", control["gait"], phase, axis=0))
         graph.clip(moved, control["ctrl_low"], control["ctrl_high"], output="ctrl")
-    types = onnx.TensorProto
-    declare = onnx.helper.make_tensor_value_info
     model = onnx.helper.make_model(
         onnx.helper.make_graph(
             graph.nodes,
             "policy",
-            [declare(name, types.FLOAT, shape) for name, shape in inputs.items()],
-            [
-                declare(name, types.FLOAT if len(shape) == 2 else types.INT64, shape)
-                for name, shape in outputs.items()
-            ],
+            _declarations(onnx, inputs),
+            _declarations(onnx, outputs),
             graph.arrays,
         ),
         producer_name="mjx_reinforce",
@@ -96,6 +96,15 @@ def onnx_policy(arithmetic: Arithmetic, run: str, env: str, seed: int) -> bytes:
         ir_version=_IR_VERSION,
     )
     return model.SerializeToString()
+
+
+def _declarations(onnx: Any, shapes: dict[str, Sequence[str | int]]) -> list[Any]:
+    """Returns the inputs or the outputs of a graph: rows of numbers, and integers [N]."""
+    types = {1: onnx.TensorProto.INT64, 2: onnx.TensorProto.FLOAT}
+    return [
+        onnx.helper.make_tensor_value_info(name, types[len(shape)], shape)
+        for name, shape in shapes.items()
+    ]
 
 
 def _act(graph: _Nodes, arithmetic: Arithmetic, x: str) -> None:

@@ -1,6 +1,8 @@
 """What a robot's program needs beside the network: the memory of observations, and the control."""
 
 import sys
+from types import SimpleNamespace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import MjSpec
 from mjx_reinforce import Box
+from mjx_reinforce.envs import parts
 from mjx_reinforce.envs.base import MujocoEnv
 
 SPEC = MjSpec.from_string('''<mujoco><worldbody>
@@ -48,6 +51,27 @@ class Servos(MujocoEnv):
 
     def outcome(self, before, data, action):
         return 0.0, False, {}
+
+class Walker(Servos):
+    gait = np.array([[0.3, 0.0, 1.0], [0.0, -0.4, 0.5], [-0.2, 0.6, 0.0]])
+
+    def memory(self, rng, data):
+        return {"step": 0}
+
+    def actuate(self, before, action):
+        return self.control(action) + parts.cyclic(self.gait, before.memory["step"])
+
+class Endless(Servos):
+    gait = np.array([[np.inf, 0.0, 0.0]])
+
+class Flat(Servos):
+    gait = np.zeros(3)
+
+class Narrow(Servos):
+    gait = np.zeros((5, 2))
+
+class Trot(Servos):
+    gait = "trot"
 
 class Bent(Servos):
     def control(self, action):
@@ -74,10 +98,29 @@ def task_run(folder, monkeypatch, name="Servos"):
 def controls(actions):
     """Returns what the task applies of actions, and MuJoCo clamps to the ranges of actuators."""
     task = envs.make("servos_of_test:Servos")
-    low, high = [-1, 0.1, -np.inf], [1, 2, np.inf]
-    return np.clip([task.control(jnp.asarray(action)) for action in actions], low, high)
+    return np.clip([task.control(jnp.asarray(action)) for action in actions], *RANGES)
 
 
+#: What MuJoCo clamps the controls of the tasks to.
+RANGES = np.array([[-1, 0.1, -np.inf], [1, 2, np.inf]])
+WALKS = """\
+#include "walk.h"
+#ifdef __cplusplus
+extern "C" {
+#endif
+void apply(int count, const float *actions, const unsigned *steps, float *ctrl);
+void apply(int count, const float *actions, const unsigned *steps, float *ctrl) {
+    for (int n = 0; n < count; n++)
+        walk_control(actions + n * WALK_ACTION_SIZE, steps[n], ctrl + n * WALK_ACTION_SIZE);
+}
+void act(const float *observation, float *action);
+void act(const float *observation, float *action) {
+    walk_act(observation, action);
+}
+#ifdef __cplusplus
+}
+#endif
+"""
 #: Functions that both languages have.
 CALLS = """\
 #include "walk.h"
@@ -145,6 +188,73 @@ def test_the_control_of_the_task_comes_into_the_files(tmp_path, monkeypatch):
     for action, control in zip(actions, expected, strict=True):
         library.apply(pointer(action))
         np.testing.assert_allclose(action, control, rtol=1e-5)
+
+
+def walks(actions, steps):
+    """Returns what the task applies of actions at env steps, clamped as by MuJoCo."""
+    task: Any = envs.make("servos_of_test:Walker")
+    befores = [SimpleNamespace(memory={"step": step}) for step in steps]
+    applied = [
+        task.actuate(before, jnp.asarray(action))
+        for before, action in zip(befores, actions, strict=True)
+    ]
+    return np.clip(applied, *RANGES)
+
+
+def walking_run(folder, monkeypatch, *files):
+    """Exports a run of a task with a gait into files, and returns actions and env steps."""
+    run = task_run(folder, monkeypatch, "Walker")
+    for name in files:
+        run_export(monkeypatch, run, "--env", "servos_of_test:Walker", "--output", folder / name)
+    rng = np.random.default_rng(0)
+    return rng.uniform(-3, 3, size=(1000, 3)).astype(np.float32), rng.integers(0, 10**6, 1000)
+
+
+@needs_compiler
+@pytest.mark.parametrize("language", COMPILERS)
+def test_a_header_adds_the_gait(tmp_path, monkeypatch, language):
+    actions, steps = walking_run(tmp_path, monkeypatch, "walk.h")
+    library = load_library(tmp_path, WALKS, language)
+    ctrl = np.full((len(actions), 3), np.nan, np.float32)
+    library.apply(len(actions), pointer(actions), pointer(steps.astype(np.uint32)), pointer(ctrl))
+    np.testing.assert_allclose(ctrl, walks(actions, steps), atol=1e-5)
+
+
+def test_a_module_adds_the_gait(tmp_path, monkeypatch):
+    actions, steps = walking_run(tmp_path, monkeypatch, "walk.npz")
+    module = import_file(tmp_path / "walk.py")
+    expected = walks(actions, steps)
+    np.testing.assert_allclose(module.control(actions, steps), expected, atol=1e-5)
+    ctrl = module.control(actions[0], int(steps[0]))
+    np.testing.assert_allclose(ctrl, expected[0], atol=1e-5)
+
+
+def test_a_graph_adds_the_gait(tmp_path, monkeypatch):
+    pytest.importorskip("onnx")
+    _, steps = walking_run(tmp_path, monkeypatch, "walk.onnx")
+    inputs = {"observation": OBSERVATIONS.astype(np.float32), "step": steps}
+    action, ctrl = onnx_session(tmp_path / "walk.onnx").run(["action", "ctrl"], inputs)
+    np.testing.assert_allclose(ctrl, walks(action, steps), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("kind", "shape"),
+    [
+        ("Endless", "float64[1, 3]"),
+        ("Flat", "float64[3]"),
+        ("Narrow", "float64[5, 2]"),
+        ("Trot", "<U4[]"),
+    ],
+)
+def test_a_gait_that_is_no_table_is_refused(tmp_path, monkeypatch, capsys, kind, shape):
+    run = task_run(tmp_path, monkeypatch, kind)
+    with pytest.raises(SystemExit, match="2"):
+        run_export(
+            monkeypatch, run, "--env", f"servos_of_test:{kind}", "--output", tmp_path / "w.h"
+        )
+    error = capsys.readouterr().err
+    assert f"gait of {kind} is what actuate adds" in error
+    assert f"finite numbers [P, 3], got {shape}" in error
 
 
 @pytest.mark.parametrize(
