@@ -63,7 +63,7 @@ def test_the_commands_of_the_class_train_and_export(dog, tmp_path):
     for name in dog.WEIGHTS:
         assert np.isfinite(float(rows[-1][f"eval_reward_{name}"]))
     header = Path(dog.__file__).with_name("my_dog_policy.h").read_text()
-    assert "void my_dog_policy_control(const float *action, float *ctrl)" in header
+    assert "void my_dog_policy_control(const float *action, unsigned step, float *ctrl)" in header
 
 
 @pytest.fixture(scope="module")
