@@ -1,7 +1,10 @@
 """The class that is written of a robot on legs: what it says, and what its episodes do."""
 
+import csv
 import importlib
+import json
 import shutil
+import subprocess
 import sys
 import types
 from pathlib import Path
@@ -16,6 +19,7 @@ from places import ROOT
 
 import mjx_reinforce as mr
 from mjx_reinforce import envs
+from mjx_reinforce.settings.defaults import PRESETS
 from mjx_reinforce.templates.facts import class_name
 
 QUADRUPED = ROOT / "experiments" / "examples" / "quadruped.xml"
@@ -36,6 +40,30 @@ def dog(tmp_path_factory):
         patch.syspath_prepend(folder)
         write(patch, "my_dog.xml")
         yield importlib.import_module("my_dog")
+
+
+@pytest.mark.slow
+def test_the_commands_of_the_class_train_and_export(dog, tmp_path):
+    """Two updates of the preset, in place of minutes."""
+    words = dog.__doc__.replace("--minutes 20", "").partition("python ")[2].partition("\n\n")[0]
+    train, watch, export = (command.split() for command in words.split("python "))
+    assert watch == ["-m", "mjx_reinforce.watch", "my_dog_run", "--env", "my_dog:MyDog"]
+    short = "--max-updates 2 --env-steps None --num-seeds 1 --num-episodes 8 --train-horizon 10"
+    short += " --value-batch-size 8 --horizon 20 --eval-every 1 --eval-episodes 2"
+    for command in ([*train, *short.split()], export):
+        subprocess.run([sys.executable, *command], check=True, cwd=Path(dog.__file__).parent)
+    run = Path(dog.__file__).with_name("my_dog_run")
+    config = json.loads((run / "config.json").read_text())
+    preset = vars(PRESETS["legged"][1])
+    for name in ("hidden_sizes", "update", "estimator", "max_kl", "discount", "initial_std"):
+        assert config[name] == json.loads(json.dumps(preset[name]))
+    with (run / "metrics.csv").open() as file:
+        rows = [*csv.DictReader(file)]
+    assert [int(row["update"]) for row in rows] == [0, 1, 2]
+    for name in dog.WEIGHTS:
+        assert np.isfinite(float(rows[-1][f"eval_reward_{name}"]))
+    header = Path(dog.__file__).with_name("my_dog_policy.h").read_text()
+    assert "void my_dog_policy_control(const float *action, unsigned step, float *ctrl)" in header
 
 
 @pytest.fixture(scope="module")
