@@ -30,21 +30,21 @@ def action_lines(model: "MjModel", array: str) -> Iterator[str]:
         yield f"    {array}[{i}]: actuator {name}{limits}"
 
 
-def has_servos(model: "MjModel") -> bool:
-    """Returns whether every control of a model is the position to which a servo moves a joint."""
+def is_servo(model: "MjModel") -> np.ndarray:
+    """Returns of each control [nu] whether it is the position to which a servo moves a joint."""
     import mujoco
 
     c: Any = mujoco
     is_of_joint = model.actuator_trntype == c.mjtTrn.mjTRN_JOINT
-    if not is_of_joint.all():
-        return False
-    joint_types = model.jnt_type[model.actuator_trnid[:, 0]]
+    if not is_of_joint.any():
+        return is_of_joint
+    joint_types = model.jnt_type[np.where(is_of_joint, model.actuator_trnid[:, 0], 0)]
     is_scalar = np.isin(joint_types, (c.mjtJoint.mjJNT_HINGE, c.mjtJoint.mjJNT_SLIDE))
     # As ``<position>`` is: the force is a stiffness times the way that is left, and damping.
     is_affine = model.actuator_biastype == c.mjtBias.mjBIAS_AFFINE
     is_pulled = model.actuator_biasprm[:, 1] == -model.actuator_gainprm[:, 0]
     is_direct = model.actuator_gear[:, 0] == 1
-    return bool((is_scalar & is_affine & is_pulled & is_direct).all())
+    return is_of_joint & is_scalar & is_affine & is_pulled & is_direct
 
 
 def direction_up(model: "MjModel") -> list[float]:

@@ -61,25 +61,42 @@ _START = """\
         return {{"qpos": qpos, "ctrl": jnp.asarray(self.home)}}"""
 
 
-def is_legged(model: "MjModel") -> bool:
-    """Returns whether a model is a robot that stands on its feet, with servos in all joints.
+def is_free(model: "MjModel") -> bool:
+    """Returns whether the first joint of a model is free (type 0), as that of a robot on legs."""
+    return bool(model.njnt > 0 and model.jnt_type[0] == 0)
 
-    Its body, which is to be upright, and the joints of its servos have names.
+
+def lacking(model: "MjModel") -> str | None:
+    """Returns in words the first thing that a model lacks for the class of a robot on legs.
+
+    Args:
+      model: one that ``is_free``.
+
+    Returns:
+      None where it lacks nothing.
     """
     from mjx_reinforce.envs.parts import feet
+    from mjx_reinforce.envs.refusals import listed
 
-    is_free = bool(model.njnt > 0 and model.jnt_type[0] == 0)
-    if not is_free or not facts.has_servos(model) or len(feet(model)) < 2:
-        return False
-    names = [_body(model), *_joints(model)]
-    return all(names) and np.allclose(facts.direction_up(model), [0, 0, 1], atol=0.1)
+    is_servo = facts.is_servo(model)
+    if not is_servo.all():
+        names = [model.actuator(int(i)).name or f"number {i}" for i in np.flatnonzero(~is_servo)]
+        return f"<position> servos with gear 1 of hinges or slides in place of {listed(names)}"
+    if len(feet(model)) < 2:
+        return "two feet that come nearest to a floor, below its body, in the first key frame"
+    if not all([_body(model), *_joints(model)]):
+        return "names of the free joint's body and of all joints"
+    up = facts.direction_up(model)
+    if not np.allclose(up, [0, 0, 1], atol=0.1):
+        return f"a body whose z axis is up in the first pose, where up is {up}"
+    return None
 
 
 def class_source(model: "MjModel", xml: str, module: str) -> str:
     """Returns the text of the class, as ``model_class.class_source``.
 
     Args:
-      model: one that ``is_legged``.
+      model: one that ``is_free`` and lacks nothing.
       xml: the name of its file, in the folder of the class.
       module: the name of the class's file, without its ending.
     """
