@@ -72,10 +72,14 @@ def write_class(settings: NewSettings) -> None:
     if lack is not None:
         print(f"for the class of a robot on legs the model lacks {lack}")
     task = f"{module}:{class_name(module)}"
-    command = "train legged" if is_legged else "train"
-    advice = "it walks as commanded; read it" if is_legged else "write its reward"
+    advice = "write its reward"
+    preset, budget = "", ""
+    if is_legged:
+        advice = "it walks as commanded; read it"
+        # The minute of other presets is too short to learn to walk.
+        preset, budget = " legged", " --minutes 20"
     print(f"{output}: {advice}, then, in its folder:")
-    print(f"  python -m mjx_reinforce.{command} --env {task} --output {module}_run")
+    print(f"  python -m mjx_reinforce.train{preset} --env {task}{budget} --output {module}_run")
 
 
 def _path(xml: Path) -> str:

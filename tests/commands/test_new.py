@@ -188,11 +188,13 @@ def test_what_keeps_a_robot_from_legs_is_named(tmp_path, monkeypatch, capsys, la
     if words is None:
         assert "lacks" not in said
         assert "robot.py: it walks as commanded" in said
-        assert "train legged --env robot:Robot" in said
+        assert "train legged --env robot:Robot --minutes 20 --output robot_run" in said
+        # Without the task, the policy in C would have no control.
+        assert "export robot_run --env robot:Robot" in (tmp_path / "robot.py").read_text()
     else:
         assert f"for the class of a robot on legs the model lacks {words}" in said
         assert "robot.py: write its reward" in said
-        assert "train --env robot:Robot" in said
+        assert "train --env robot:Robot --output robot_run" in said
 
 
 def test_a_model_that_mjx_refuses_is_played_by_c_mujoco(tmp_path, monkeypatch, capsys):
