@@ -59,7 +59,8 @@ def write_class(settings: NewSettings) -> None:
     if in_c is None:
         models.to_mjx(model, path)
     module = output.stem
-    is_legged = legged.is_legged(model)
+    lack = legged.lacking(model) if legged.is_free(model) else None
+    is_legged = legged.is_free(model) and lack is None
     template = legged if is_legged else model_class
     write_bytes(output, template.class_source(model, xml.name, module).encode())
     print(contact_counts(model))
@@ -68,10 +69,17 @@ def write_class(settings: NewSettings) -> None:
         print(warning)
     if not settings.fix:
         _offer_fix(path)
+    if lack is not None:
+        print(f"for the class of a robot on legs the model lacks {lack}")
     task = f"{module}:{class_name(module)}"
-    command = "train legged" if is_legged else "train"
-    print(f"{output}: write its reward, then, in its folder:")
-    print(f"  python -m mjx_reinforce.{command} --env {task} --output {module}_run")
+    advice = "write its reward"
+    preset, budget = "", ""
+    if is_legged:
+        advice = "it walks as commanded; read it"
+        # The minute of other presets is too short to learn to walk.
+        preset, budget = " legged", " --minutes 20"
+    print(f"{output}: {advice}, then, in its folder:")
+    print(f"  python -m mjx_reinforce.train{preset} --env {task}{budget} --output {module}_run")
 
 
 def _path(xml: Path) -> str:

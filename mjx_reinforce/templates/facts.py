@@ -45,15 +45,15 @@ def action_lines(model: "MjModel", array: str) -> Iterator[str]:
         yield f"    {array}[{i}]: actuator {quoted(name)}{limits}"
 
 
-def has_servos(model: "MjModel") -> bool:
-    """Returns whether every control of a model is the position to which a servo moves a joint."""
+def is_servo(model: "MjModel") -> np.ndarray:
+    """Returns of each control [nu] whether it is the position to which a servo moves a joint."""
     import mujoco
 
     c: Any = mujoco
     is_of_joint = model.actuator_trntype == c.mjtTrn.mjTRN_JOINT
-    if not is_of_joint.all():
-        return False
-    joint_types = model.jnt_type[model.actuator_trnid[:, 0]]
+    if not is_of_joint.any():
+        return is_of_joint
+    joint_types = model.jnt_type[np.where(is_of_joint, model.actuator_trnid[:, 0], 0)]
     is_scalar = np.isin(joint_types, (c.mjtJoint.mjJNT_HINGE, c.mjtJoint.mjJNT_SLIDE))
     # As ``<position>`` is: the force is a stiffness times the way that is left, and damping.
     is_affine = model.actuator_biastype == c.mjtBias.mjBIAS_AFFINE
@@ -62,7 +62,7 @@ def has_servos(model: "MjModel") -> bool:
     # Of an integrator, as <intvelocity> has one, the control is a speed.
     lags = (c.mjtDyn.mjDYN_NONE, c.mjtDyn.mjDYN_FILTER, c.mjtDyn.mjDYN_FILTEREXACT)
     is_position = np.isin(model.actuator_dyntype, lags)
-    return bool((is_scalar & is_affine & is_pulled & is_direct & is_position).all())
+    return is_of_joint & is_scalar & is_affine & is_pulled & is_direct & is_position
 
 
 def direction_up(model: "MjModel") -> list[float]:

@@ -63,25 +63,44 @@ _CONTROLS = '"ctrl": jnp.asarray(self.home)'
 _ACTIVATIONS = ', "act": jnp.asarray(self.home)'
 
 
-def is_legged(model: "MjModel") -> bool:
-    """Returns whether a model is a robot that stands on its feet, and is moved by servos alone.
+def is_free(model: "MjModel") -> bool:
+    """Returns whether the first joint of a model is free (type 0), as that of a robot on legs."""
+    return bool(model.njnt > 0 and model.jnt_type[0] == 0)
 
-    Its body, which is to be upright, has a name; the joints of servos always have.
+
+def lacking(model: "MjModel") -> str | None:
+    """Returns in words the first thing that a model lacks for the class of a robot on legs.
+
+    Args:
+      model: one that ``is_free``.
+
+    Returns:
+      None where it lacks nothing.
     """
     from mjx_reinforce.envs.parts import feet
+    from mjx_reinforce.envs.refusals import listed
 
-    is_free = bool(model.njnt > 0 and model.jnt_type[0] == 0)
-    if not is_free or not _body(model) or not facts.has_servos(model) or len(feet(model)) < 2:
-        return False
-    lag_alike = model.na in (0, model.nu)
-    return lag_alike and np.allclose(facts.direction_up(model), [0, 0, 1], atol=0.1)
+    is_servo = facts.is_servo(model)
+    if not is_servo.all():
+        names = [model.actuator(int(i)).name or f"number {i}" for i in np.flatnonzero(~is_servo)]
+        return f"<position> servos with gear 1 of hinges or slides in place of {listed(names)}"
+    if len(feet(model)) < 2:
+        return "two feet that come nearest to a floor, below its body, in the first key frame"
+    if model.na not in (0, model.nu):
+        return "servos that all lag, or none"
+    if not _body(model):
+        return "a name of the body of its free joint"
+    up = facts.direction_up(model)
+    if not np.allclose(up, [0, 0, 1], atol=0.1):
+        return f"a body whose z axis is up in the first pose, where up is {up}"
+    return None
 
 
 def class_source(model: "MjModel", xml: str, module: str) -> str:
     """Returns the text of the class, as ``model_class.class_source``.
 
     Args:
-      model: one that ``is_legged``.
+      model: one that ``is_free`` and lacks nothing.
       xml: the name of its file, in the folder of the class.
       module: the name of the class's file, without its ending.
     """

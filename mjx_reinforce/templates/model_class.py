@@ -111,7 +111,7 @@ def _start_and_home(model: "MjModel", is_free: bool) -> dict[str, Any]:
     if not model.nkey:
         return placeholders
     has_controls = bool(model.key_ctrl[0].any())
-    has_servos = facts.has_servos(model)
+    has_servos = bool(facts.is_servo(model).all())
     ctrl = ""
     if has_servos and not has_controls:
         ctrl = ', "ctrl": self.home'

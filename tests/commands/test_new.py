@@ -153,6 +153,40 @@ def test_servos_whose_key_frame_has_no_controls_hold_its_angles(tmp_path, monkey
     lint("legs.py")
 
 
+#: What a quadruped no longer has: an edit of its file, and what ``new`` says of it.
+LACKS = {
+    "servos": ("<position joint", "<motor joint", "<position> servos with gear 1 of hinges"),
+    "a floor": (
+        'conaffinity="1" rgba',
+        'contype="0" rgba',
+        "two feet that come nearest to a",
+    ),
+    "names": ('name="torso"', "", "names of the free joint's body and of all joints"),
+    "nothing": ("", "", None),
+}
+
+
+@pytest.mark.parametrize("lack", LACKS)
+def test_what_keeps_a_robot_from_legs_is_named(tmp_path, monkeypatch, capsys, lack):
+    part, other_part, words = LACKS[lack]
+    text = (EXAMPLES / "quadruped.xml").read_text()
+    assert part in text
+    (tmp_path / "robot.xml").write_text(text.replace(part, other_part))
+    monkeypatch.chdir(tmp_path)
+    write(monkeypatch, "robot.xml")
+    said = capsys.readouterr().out
+    if words is None:
+        assert "lacks" not in said
+        assert "robot.py: it walks as commanded" in said
+        assert "train legged --env robot:Robot --minutes 20 --output robot_run" in said
+        # Without the task, the policy in C would have no control.
+        assert "export robot_run --env robot:Robot" in (tmp_path / "robot.py").read_text()
+    else:
+        assert f"for the class of a robot on legs the model lacks {words}" in said
+        assert "robot.py: write its reward" in said
+        assert "train --env robot:Robot --output robot_run" in said
+
+
 def test_a_model_that_mjx_refuses_is_played_by_c_mujoco(tmp_path, monkeypatch, capsys):
     arm = (EXAMPLES / "my_arm.xml").read_text()
     (tmp_path / "pgs.xml").write_text(arm.replace("<option", '<option solver="PGS"'))
