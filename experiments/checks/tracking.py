@@ -5,14 +5,14 @@
 The task is one that ``python -m mjx_reinforce.new`` wrote, in the folder at hand. Each episode has
 one command, with the task's noise, delay, and pushes. A row is the mean absolute error of a seed's
 last policy over all but the first seconds of 100 episodes of 10 s. From a fall on, the error is the
-whole command.
+whole command. The last row is what a robot that stands still would have: the mean of the commands.
 """
 
 import dataclasses
 import importlib
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,8 +43,21 @@ class TrackingSettings:
     """What plays them."""
 
 
-def tracking_errors(settings: TrackingSettings, task: Any, seed: int) -> tuple[np.ndarray, float]:
-    """Returns the mean absolute errors [3] of a seed's policy, and the share that did not fall."""
+class Tracking(NamedTuple):
+    """How well a policy follows its commands.
+
+    errors: [3] mean absolute, in the units of ERRORS
+    commands: [3] mean absolute: the errors of a robot that stands still
+    standing: the share of episodes without a fall
+    """
+
+    errors: np.ndarray
+    commands: np.ndarray
+    standing: float
+
+
+def tracking(settings: TrackingSettings, task: Any, seed: int) -> Tracking:
+    """Returns how well a seed's policy follows its commands."""
     env = _with_one_command(task)()
     vec = make_vec(env, settings.episodes, engine=settings.engine, autoreset="disabled")
     weights = sys.modules[task.__module__].WEIGHTS
@@ -61,7 +74,11 @@ def tracking_errors(settings: TrackingSettings, task: Any, seed: int) -> tuple[n
         stands &= ~np.asarray(state.terminated)
         errors.append(np.where(stands[:, None], np.stack(terms, axis=1), commands))
     counted = errors[round(settings.ignored_seconds / env.dt) :]
-    return np.mean(counted, axis=(0, 1)), float(stands.mean())
+    return Tracking(
+        errors=np.mean(counted, axis=(0, 1)),
+        commands=np.mean(commands, axis=0),
+        standing=float(stands.mean()),
+    )
 
 
 def _with_one_command(task: Any) -> Any:
@@ -82,9 +99,17 @@ def main() -> None:
     seeds = run.seeds or range(read_json(settings.run / "config.json")["num_seeds"])
     print("| seed | " + " | ".join(f"{name} ({unit})" for name, unit in ERRORS.items()), end="")
     print(" | did not fall |\n|---|---|---|---|---|")
-    for seed in seeds:
-        errors, standing = tracking_errors(settings, task, seed)
-        print(f"| {seed} | " + " | ".join(f"{x:.3f}" for x in errors), f"| {standing:.0%} |")
+    results = {seed: tracking(settings, task, seed) for seed in seeds}
+    for seed, result in results.items():
+        print(_row(str(seed), result.errors, f"{result.standing:.0%}"))
+    commands = np.mean([result.commands for result in results.values()], axis=0)
+    print(_row("stands still", commands, ""))
+
+
+def _row(label: str, errors: np.ndarray, share: str) -> str:
+    """Returns a row of the table: errors [3], and the share that did not fall."""
+    cells = [label, *(f"{error:.3f}" for error in errors), share]
+    return f"| {' | '.join(cells)} |"
 
 
 if __name__ == "__main__":
