@@ -188,7 +188,8 @@ def _names() -> str:
     width = max(map(len, PRESETS))
     presets = "\n".join(f"  {name:{width}}  {summary}" for name, (summary, _) in PRESETS.items())
     return (
-        f"Presets, published programs whose settings replace the defaults:\n{presets}\n\n"
+        "Presets, whose settings replace the defaults (all but legged are published programs):\n"
+        f"{presets}\n\n"
         f"Environments: {', '.join(envs.names())}."
     )
 

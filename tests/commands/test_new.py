@@ -161,7 +161,7 @@ LACKS = {
         'contype="0" rgba',
         "two feet that come nearest to a",
     ),
-    "names": ('name="torso"', "", "names of the free joint's body and of all joints"),
+    "a name": ('name="torso"', "", "a name of the body of its free joint"),
     "nothing": ("", "", None),
 }
 

@@ -131,3 +131,9 @@ def test_defaults_that_a_policy_does_not_read_are_not_the_users(id, words):
         changed = dataclasses.replace(config, initial_std=1.0)
         with pytest.raises(ValueError, match=r"--initial-std 1\.0 would do nothing"):
             check_read_by_policy(changed, default, family)
+
+
+def test_a_preset_without_a_task_asks_for_one(run, tmp_path, capsys):
+    assert run("legged", "--output", "out") == 2
+    assert "no environment is named: add --env" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
