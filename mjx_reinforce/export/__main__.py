@@ -1,6 +1,7 @@
 """``python -m mjx_reinforce.export RUN`` takes a trained policy out of the program."""
 
 import dataclasses
+import sys
 from pathlib import Path
 
 import tyro
@@ -34,7 +35,17 @@ class ExportSettings:
 
 def main() -> None:
     """Reads the command line, exports, and exits: 0 done, 2 bad input, 130 interrupted."""
-    run_command(ExportSettings, "export", lambda settings: print(*export(settings), sep="\n"))
+    run_command(ExportSettings, "export", export_and_say)
+
+
+def export_and_say(settings: ExportSettings) -> None:
+    """Writes the files, prints their names, and says if a control is missing in them."""
+    print(*export(settings), sep="\n")
+    env = read_run(settings.run).env
+    # Only a task of the user's own may have one; its code runs only where it is named.
+    if settings.env is None and ":" in env:
+        note = "the file has actions alone: for the task's control, home + scale * action, add"
+        print(f"{note} --env {env}", file=sys.stderr)
 
 
 def export(settings: ExportSettings) -> list[Path]:

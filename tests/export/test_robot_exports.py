@@ -328,3 +328,12 @@ def test_what_is_not_installed_is_named(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit, match="2"):
         run_export(monkeypatch, make_run(tmp_path), "--output", tmp_path / "walk.onnx")
     assert "pip install 'mjx-reinforce[onnx]'" in capsys.readouterr().err
+
+
+def test_a_file_without_the_control_of_a_task_says_so(tmp_path, monkeypatch, capsys):
+    run = make_run(tmp_path)
+    run_export(monkeypatch, run)
+    assert capsys.readouterr().err == ""
+    change_env(run, "task:Servos")
+    run_export(monkeypatch, run, "--overwrite")
+    assert "home + scale * action, add --env task:Servos" in capsys.readouterr().err
