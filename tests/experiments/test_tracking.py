@@ -47,12 +47,15 @@ def test_a_robot_that_stands_misses_its_whole_command(task, resting_run, monkeyp
     monkeypatch.setattr(sys, "argv", ["tracking", str(resting_run), "--episodes", "4"])
     capsys.readouterr()
     tracking.main()
-    title, _, row = capsys.readouterr().out.splitlines()
+    title, _, row, still = capsys.readouterr().out.splitlines()
     units = "| seed | forward_error (m/s) | sideways_error (m/s) | turn_error (rad/s) |"
     assert title == f"{units} did not fall |"
     seed, *errors, standing = row.strip("|").split("|")
     assert (int(seed), standing.strip()) == (0, "100%")
     np.testing.assert_allclose([*map(float, errors)], np.abs(COMMAND), atol=0.02)
+    label, *commands, _ = still.strip("|").split("|")
+    assert label.strip() == "stands still"
+    np.testing.assert_allclose([*map(float, commands)], np.abs(COMMAND), atol=1e-3)
 
 
 def test_a_fall_counts_as_the_whole_command(task, resting_run, monkeypatch):
@@ -70,7 +73,8 @@ def test_a_fall_counts_as_the_whole_command(task, resting_run, monkeypatch):
 
     monkeypatch.setattr(Falls, "__module__", "tracked")
     settings = tracking.TrackingSettings(resting_run, episodes=2, ignored_seconds=0.2)
-    errors, standing = tracking.tracking_errors(settings, Falls, 0)
+    result = tracking.tracking(settings, Falls, 0)
     # Of 40 env steps that count, 14 are before the one that ends at 0.5 s.
-    np.testing.assert_allclose(errors, 26 / 40 * np.abs(COMMAND), rtol=1e-5)
-    assert standing == 0
+    np.testing.assert_allclose(result.errors, 26 / 40 * np.abs(COMMAND), rtol=1e-5)
+    np.testing.assert_allclose(result.commands, np.abs(COMMAND), rtol=1e-6)
+    assert result.standing == 0
