@@ -74,10 +74,11 @@ def capsule_box(capsule: GeomInfo, box: GeomInfo) -> Collision:
 
 
 # The edges of a box in C's order: the axis along which each runs, and the signs of the other two
-# coordinates.
+# coordinates. Of 32 bits: where a process has numbers of both precisions, JAX 0.10.2 may run a
+# program for 32 bits on an array of 64.
 _AXES = np.repeat(np.eye(3, dtype=bool), 4, axis=0)
 _CORNER_BITS = np.array([0, 2, 4, 6, 0, 1, 4, 5, 0, 1, 2, 3])[:, None] >> np.arange(3) & 1
-_SIGNS = np.where(_AXES, 0, 2 * _CORNER_BITS - 1)
+_SIGNS = np.where(_AXES, 0, 2 * _CORNER_BITS - 1).astype(np.int32)
 
 
 def _along_capsule(
