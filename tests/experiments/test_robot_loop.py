@@ -58,6 +58,7 @@ KEY = """<keyframe>
   <key qpos="1 2 0.31 1 0 0 0 0 0.1 -0.2 0 0.1 -0.2 0 0.1 -0.2 0 0.1 -0.2"/></keyframe></mujoco>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", ["", KEY])
 def test_the_loop_walks_as_the_class_that_new_writes(tmp_path, monkeypatch, key):
     """Its observations and controls are those of the task without noise and pushes."""

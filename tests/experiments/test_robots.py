@@ -62,6 +62,7 @@ def test_each_model_has_a_row_and_is_judged_once(tmp_path):
         assert float(row["ratio"]) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(device_code.COMPILER is None, reason="there is no C++ compiler")
 def test_teams_are_compared_with_c_mujoco_and_counted(tmp_path, capsys):
     folder = tmp_path / "mujoco_menagerie" / "slider"

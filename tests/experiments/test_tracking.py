@@ -43,6 +43,7 @@ def resting_run(tmp_path):
     return run
 
 
+@pytest.mark.slow
 def test_a_robot_that_stands_misses_its_whole_command(task, resting_run, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["tracking", str(resting_run), "--episodes", "4"])
     capsys.readouterr()
@@ -58,6 +59,7 @@ def test_a_robot_that_stands_misses_its_whole_command(task, resting_run, monkeyp
     np.testing.assert_allclose([*map(float, commands)], np.abs(COMMAND), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_fall_counts_as_the_whole_command(task, resting_run, monkeypatch):
     """Before it, this robot does as it is commanded."""
 

@@ -184,6 +184,7 @@ def test_a_search_that_stops_early_solves_for_no_damping_that_is_not_drawn(tmp_p
         assert touched > 10
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("lanes", [1, 8])
 @pytest.mark.parametrize("options", _MARKED)

@@ -63,6 +63,7 @@ FIELDS += ("cam_xpos", "subtree_com", "ten_length", "actuator_length", "actuator
 PARTS = {"option": "", "flags": "", "zone": "sphere", "more": ""}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["", 'integrator="implicitfast"'])
 def test_fields_and_sensors_are_those_of_c(option):
     model = mujoco.MjModel.from_xml_string(ROBOT.format_map(PARTS | {"option": option}))

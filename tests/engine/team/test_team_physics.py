@@ -160,6 +160,7 @@ def test_lanes_in_any_order_play_alike(task, lanes, tmp_path):
     assert _largest_error(_exact(m), tmp_path, skip=2, starts=1, lanes=lanes) < 1e-9
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("option", ["", 'iterations="2" ls_iterations="4"'])
 @pytest.mark.parametrize(("nv", "lanes"), [(31, 32), (35, 32), (36, 4)])
