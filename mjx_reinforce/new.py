@@ -3,11 +3,15 @@
 import dataclasses
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
 from mjx_reinforce.files import check_module, check_output, write_bytes
 from mjx_reinforce.settings.flags import run_command
+
+if TYPE_CHECKING:
+    from mjx_reinforce.envs.mending.edits import Mended
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,18 +44,21 @@ def write_class(settings: NewSettings) -> None:
     xml = settings.model
     if xml.suffix.lower() != ".xml":
         raise ValueError(f"{xml} is not a model; give an MJCF file that ends in .xml")
-    if settings.fix:
-        xml = _write_fixed(settings)
+    mended = _mend(settings) if settings.fix else None
+    if mended is not None:
+        xml = xml.with_name(f"{xml.stem}_fixed.xml")
     output = settings.output or xml.with_name(f"{re.sub(r'[^0-9a-zA-Z]+', '_', xml.stem)}.py")
     check_module(output, "my_robot.py")
     if output.parent.resolve() != xml.parent.resolve():
         raise ValueError(f"{output} must be in the folder of {xml}, where it looks for the model")
     check_output(output, settings.overwrite, ".py")
+    if mended is not None:
+        _write_fixed(mended, xml, settings.overwrite)
     from mjx_reinforce.envs import models, refusals
     from mjx_reinforce.envs.instability import instability
     from mjx_reinforce.envs.mending.ground import contact_counts
     from mjx_reinforce.templates import legged, model_class
-    from mjx_reinforce.templates.facts import class_name
+    from mjx_reinforce.templates.facts import class_name, is_free
 
     path = _path(xml)
     model = models.load_model(path)
@@ -59,8 +66,8 @@ def write_class(settings: NewSettings) -> None:
     if in_c is None:
         models.to_mjx(model, path)
     module = output.stem
-    lack = legged.lacking(model) if legged.is_free(model) else None
-    is_legged = legged.is_free(model) and lack is None
+    lack = legged.lacking(model) if is_free(model) else None
+    is_legged = is_free(model) and lack is None
     template = legged if is_legged else model_class
     write_bytes(output, template.class_source(model, xml.name, module).encode())
     print(contact_counts(model))
@@ -87,11 +94,11 @@ def _path(xml: Path) -> str:
     return str(Path.cwd() / xml if xml.parent == Path() else xml)
 
 
-def _write_fixed(settings: NewSettings) -> Path:
-    """Writes the mended copy of a model beside it, and returns its path, or that of the model.
+def _mend(settings: NewSettings) -> "Mended | None":
+    """Returns a mended copy of the model, or says that there is nothing to mend.
 
     Raises:
-      ValueError: the model cannot be loaded, or there is such a file already.
+      ValueError: the model cannot be loaded.
     """
     from mjx_reinforce.envs import models
     from mjx_reinforce.envs.mending import edits
@@ -101,12 +108,15 @@ def _write_fixed(settings: NewSettings) -> Path:
     mended = edits.mend(path)
     if not mended.edits:
         print(f"{settings.model} needs no fix")
-        return settings.model
-    output = settings.model.with_name(f"{settings.model.stem}_fixed.xml")
-    check_output(output, settings.overwrite, ".xml")
+        return None
+    return mended
+
+
+def _write_fixed(mended: "Mended", output: Path, overwrite: bool) -> None:
+    """Writes a mended model, and says what was changed; ValueError if there is such a file."""
+    check_output(output, overwrite, ".xml")
     write_bytes(output, mended.spec.to_xml().encode())
     print(f"{output}:", *mended.edits, sep="\n  ")
-    return output
 
 
 def _offer_fix(path: str) -> None:

@@ -5,12 +5,13 @@ import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
 from mjx_reinforce.engine.base import MjModel
-from mjx_reinforce.engine.checks import require
+from mjx_reinforce.engine.checks import check_count, require
 from mjx_reinforce.engine.team.supported import FREE
 
 
 def is_due(step: ArrayLike, period: int) -> jax.Array:
-    """Returns whether a count of env steps is a multiple of a period (env steps)."""
+    """Returns whether a count of env steps is a multiple of a period (env steps, at least 1)."""
+    check_count("period", period)
     return jnp.asarray(step) % period == 0
 
 

@@ -13,13 +13,15 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from mjx_reinforce.engine.base import MjModel
-from mjx_reinforce.engine.checks import require
+from mjx_reinforce.engine.checks import check_count, check_number, require
 from mjx_reinforce.envs.mending.ground import first_pose, stance
 
 _C: Any = mujoco  # a C extension without stubs
 #: Steps of Newton's method on the place of a foot, and the damping of its least squares.
 _ITERATIONS = 20
 _DAMPING = 1e-4
+#: How far from its place a lifted foot may be, as a part of the height.
+_PRECISION = 0.1
 
 
 class Foot(NamedTuple):
@@ -74,8 +76,11 @@ def gait(model: MjModel, height: float, num_steps: int) -> np.ndarray:
       num_steps: env steps of a period.
 
     Raises:
-      ValueError: the robot stands on fewer than two feet.
+      ValueError: the robot stands on fewer than two feet, or a leg cannot lift its foot that far
+        from the first pose; a number is out of its range.
     """
+    check_count("num_steps", num_steps)
+    check_number("height", height)
     standing = feet(model)
     require(
         len(standing) > 1,
@@ -142,4 +147,11 @@ def _lift(model: MjModel, foot: Foot, height: float) -> np.ndarray:
         data.qpos[addresses] += columns.T @ np.linalg.solve(square, way)
         _C.mj_kinematics(model, data)
         _C.mj_comPos(model, data)
+    # A straight leg does not know which way to bend, and a short one does not reach.
+    rest = np.linalg.norm(goal - data.geom_xpos[foot.geom])
+    require(
+        rest <= _PRECISION * height,
+        f"a foot (geom {foot.geom}) is not lifted by {height:g} m: its leg leaves {rest:.2g} m of "
+        "that; bend the leg in the first key frame, or lift less",
+    )
     return data.qpos - pose

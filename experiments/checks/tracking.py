@@ -11,6 +11,7 @@ whole command. The last row is what a robot that stands still would have: the me
 import dataclasses
 import importlib
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ import numpy as np
 import tyro
 
 from mjx_reinforce import load, make_vec
+from mjx_reinforce.engine.checks import check_count, check_number
 from mjx_reinforce.export.run_files import read_run
 from mjx_reinforce.files import read_json
 
@@ -90,13 +92,14 @@ def _with_one_command(task: Any) -> Any:
 
 
 def main() -> None:
-    """Prints a row for each seed of a run."""
+    """Prints a row for each seed of a run; exits 2 where there is none of such a task."""
     settings = tyro.cli(TrackingSettings, description=__doc__)
     sys.path.insert(0, "")
-    run = read_run(settings.run)
-    module, _, name = run.env.partition(":")
-    task = getattr(importlib.import_module(module), name)
-    seeds = run.seeds or range(read_json(settings.run / "config.json")["num_seeds"])
+    try:
+        task, seeds = _task_and_seeds(settings)
+    except (ValueError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
     print("| seed | " + " | ".join(f"{name} ({unit})" for name, unit in ERRORS.items()), end="")
     print(" | did not fall |\n|---|---|---|---|---|")
     results = {seed: tracking(settings, task, seed) for seed in seeds}
@@ -104,6 +107,24 @@ def main() -> None:
         print(_row(str(seed), result.errors, f"{result.standing:.0%}"))
     commands = np.mean([result.commands for result in results.values()], axis=0)
     print(_row("stands still", commands, ""))
+
+
+def _task_and_seeds(settings: TrackingSettings) -> tuple[Any, Sequence[int]]:
+    """Returns the class of a run's task, and the numbers of the run's seeds.
+
+    Raises:
+      ValueError: the run has no policy, its task follows no commands, or a setting is out of range.
+      ImportError: the module of its task is not in the folder at hand.
+    """
+    check_count("episodes", settings.episodes)
+    check_number("ignored_seconds", settings.ignored_seconds)
+    run = read_run(settings.run)
+    module, _, name = run.env.partition(":")
+    weights = getattr(importlib.import_module(module), "WEIGHTS", {}) if name else {}
+    if not ERRORS.keys() <= set(weights):
+        raise ValueError(f"{settings.run} was trained on {run.env}, which follows no commands")
+    seeds = run.seeds or range(read_json(settings.run / "config.json")["num_seeds"])
+    return getattr(importlib.import_module(module), name), seeds
 
 
 def _row(label: str, errors: np.ndarray, share: str) -> str:

@@ -45,6 +45,11 @@ def action_lines(model: "MjModel", array: str) -> Iterator[str]:
         yield f"    {array}[{i}]: actuator {quoted(name)}{limits}"
 
 
+def is_free(model: "MjModel") -> bool:
+    """Returns whether the first joint of a model is free (type 0), as that of a robot on legs."""
+    return bool(model.njnt > 0 and model.jnt_type[0] == 0)
+
+
 def is_servo(model: "MjModel") -> np.ndarray:
     """Returns of each control [nu] whether it is the position to which a servo moves a joint."""
     import mujoco

@@ -63,21 +63,16 @@ _CONTROLS = '"ctrl": jnp.asarray(self.home)'
 _ACTIVATIONS = ', "act": jnp.asarray(self.home)'
 
 
-def is_free(model: "MjModel") -> bool:
-    """Returns whether the first joint of a model is free (type 0), as that of a robot on legs."""
-    return bool(model.njnt > 0 and model.jnt_type[0] == 0)
-
-
 def lacking(model: "MjModel") -> str | None:
     """Returns in words the first thing that a model lacks for the class of a robot on legs.
 
     Args:
-      model: one that ``is_free``.
+      model: one that is ``facts.is_free``.
 
     Returns:
       None where it lacks nothing.
     """
-    from mjx_reinforce.envs.parts import feet
+    from mjx_reinforce.envs.parts import feet, gait
     from mjx_reinforce.envs.refusals import listed
 
     is_servo = facts.is_servo(model)
@@ -93,6 +88,10 @@ def lacking(model: "MjModel") -> str | None:
     up = facts.direction_up(model)
     if not np.allclose(up, [0, 0, 1], atol=0.1):
         return f"a body whose z axis is up in the first pose, where up is {up}"
+    try:
+        gait(model, _lift(model), num_steps=1)
+    except ValueError as error:
+        return f"a gait: {error}"
     return None
 
 
@@ -100,7 +99,7 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
     """Returns the text of the class, as ``model_class.class_source``.
 
     Args:
-      model: one that ``is_free`` and lacks nothing.
+      model: one that is ``facts.is_free`` and lacks nothing.
       xml: the name of its file, in the folder of the class.
       module: the name of the class's file, without its ending.
     """
@@ -138,7 +137,7 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
             sideways=pace.sideways,
             turn=pace.turn,
             push=pace.push,
-            lift=round(min(pace.lift * height, _HIGHEST_LIFT), 3),
+            lift=_lift(model),
             lowest=round(_floor(model) + _LOWEST * height, 3),
             nu=model.nu,
             home=home,
@@ -159,6 +158,11 @@ def _pace(model: "MjModel") -> _Pace:
     return pace._replace(
         forward=round(share * pace.forward, 1), sideways=round(share * pace.sideways, 1)
     )
+
+
+def _lift(model: "MjModel") -> float:
+    """Returns how far the gait lifts a foot (m)."""
+    return round(min(_pace(model).lift * _height(model), _HIGHEST_LIFT), 3)
 
 
 def _effort(limit: str | None) -> str:

@@ -55,9 +55,8 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
     timestep = float(model.opt.timestep)
     # Actions 25 times a second, as near as whole steps of the simulation come to that.
     frame_skip = max(1, round(0.04 / timestep))
-    # A robot that stands on its own has a free joint (type 0) first, whose seven numbers are its
-    # position and its orientation.
-    is_free = bool(model.njnt > 0 and model.jnt_type[0] == 0)
+    # The seven numbers of a free joint are its position and its orientation.
+    is_free = facts.is_free(model)
     files = ["task.txt", "walk.txt" if is_free else "hold.txt"]
     template = "".join(Path(__file__).with_name(file).read_text("utf-8") for file in files)
     # Five seconds are an episode.

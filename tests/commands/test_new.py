@@ -234,7 +234,19 @@ def test_fix_writes_a_mended_copy_and_its_class(tmp_path, monkeypatch, capsys):
     assert best_in_c(env.mj_model) is None  # but machine code
     with pytest.raises(SystemExit, match="2"):
         write(monkeypatch, "servo.xml", "--fix")
+    assert "servo_fixed.py exists; pass --overwrite" in capsys.readouterr().err
+    # A model that somebody changed since is not overwritten, either.
+    (tmp_path / "servo_fixed.py").unlink()
+    with pytest.raises(SystemExit, match="2"):
+        write(monkeypatch, "servo.xml", "--fix")
     assert "servo_fixed.xml exists; pass --overwrite" in capsys.readouterr().err
+    # Where the class cannot be written, nothing is.
+    (tmp_path / "servo_fixed.xml").rename(tmp_path / "kept.xml")
+    (tmp_path / "servo_fixed.py").write_text("mine")
+    with pytest.raises(SystemExit, match="2"):
+        write(monkeypatch, "servo.xml", "--fix")
+    assert not (tmp_path / "servo_fixed.xml").exists()
+    (tmp_path / "kept.xml").rename(tmp_path / "servo_fixed.xml")
     write(monkeypatch, "servo_fixed.xml", "--fix", "--output", "twice.py")
     assert "servo_fixed.xml needs no fix\n" in capsys.readouterr().out
     assert sorted(path.name for path in tmp_path.glob("*.xml")) == ["servo.xml", "servo_fixed.xml"]

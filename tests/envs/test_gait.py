@@ -96,6 +96,26 @@ def test_a_model_without_feet_has_no_gait():
         parts.gait(model, HEIGHT, PERIOD)
 
 
+def test_a_leg_that_does_not_reach_is_named(quadruped):
+    """A straight one does not know which way to bend."""
+    with pytest.raises(ValueError, match=r"geom \d+\) is not lifted by 1 m: its leg leaves"):
+        parts.gait(quadruped, 1.0, PERIOD)
+    text = on_legs(4).replace('euler="0 30 0"', "").replace('euler="0 -60 0"', "")
+    straight = mujoco.MjModel.from_xml_string(text)
+    assert len(parts.feet(straight)) == 4
+    with pytest.raises(ValueError, match="bend the leg in the first key frame, or lift less"):
+        parts.gait(straight, HEIGHT, PERIOD)
+
+
+@pytest.mark.parametrize(
+    ("height", "num_steps", "message"),
+    [(np.nan, PERIOD, "height"), (-1.0, PERIOD, "height"), (HEIGHT, 0, "num_steps must be at")],
+)
+def test_a_gait_of_no_height_or_length_is_refused(quadruped, height, num_steps, message):
+    with pytest.raises(ValueError, match=message):
+        parts.gait(quadruped, height, num_steps)
+
+
 def test_tables_and_clocks_repeat():
     table = np.arange(12.0).reshape(4, 3)
     steps = jnp.arange(9)

@@ -336,3 +336,8 @@ def test_one_episode_in_c_mujoco_is_that_of_the_task(robot):
         observation, reward, _ = simulation.step(action)
         np.testing.assert_allclose(observation, state.obs, atol=3e-5)
         np.testing.assert_allclose(reward, state.reward, atol=1e-5)
+
+
+def test_a_period_of_no_steps_is_refused():
+    with pytest.raises(ValueError, match="period must be at least 1, got 0"):
+        parts.is_due(3, 0)

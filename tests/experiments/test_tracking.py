@@ -80,3 +80,25 @@ def test_a_fall_counts_as_the_whole_command(task, resting_run, monkeypatch):
     np.testing.assert_allclose(result.errors, 26 / 40 * np.abs(COMMAND), rtol=1e-5)
     np.testing.assert_allclose(result.commands, np.abs(COMMAND), rtol=1e-6)
     assert result.standing == 0
+
+
+@pytest.mark.parametrize(
+    ("env", "options", "message"),
+    [
+        (
+            "InvertedPendulum-v5",
+            [],
+            "was trained on InvertedPendulum-v5, which follows no commands",
+        ),
+        ("json:dumps", [], "was trained on json:dumps, which follows no commands"),
+        ("no_such_module:Robot", [], "No module named 'no_such_module'"),
+        ("json:dumps", ["--episodes", "0"], "episodes must be at least 1, got 0"),
+    ],
+)
+def test_runs_of_other_tasks_are_named(tmp_path, monkeypatch, capsys, env, options, message):
+    run = make_run(tmp_path / "run", "InvertedPendulum-v5")
+    change_env(run, env)
+    monkeypatch.setattr(sys, "argv", ["tracking", str(run), *options])
+    with pytest.raises(SystemExit, match="2"):
+        tracking.main()
+    assert message in capsys.readouterr().err
