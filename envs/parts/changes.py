@@ -41,8 +41,16 @@ def push(key: jax.Array, speed: ArrayLike, is_due: ArrayLike) -> jax.Array:
       speed: [] the most in each direction (m/s).
       is_due: [] whether there is a push; else the change is 0.
     """
-    change = jnp.asarray(speed, float) * jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)
-    return jnp.where(jnp.asarray(is_due), change, 0.0)
+
+    def change(key: jax.Array) -> jax.Array:
+        shares = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)
+        return jnp.asarray(speed, float) * shares
+
+    def no_change(key: jax.Array) -> jax.Array:
+        return jnp.zeros(2)
+
+    # A branch, as numbers are drawn in few steps.
+    return jax.lax.cond(jnp.asarray(is_due), change, no_change, key)
 
 
 def push_velocity(model: MjModel, push: jax.Array) -> jax.Array:

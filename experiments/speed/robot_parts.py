@@ -79,11 +79,15 @@ class Full(Bare):
             | {"delay": jax.random.randint(keys[6], (), 0, LONGEST_DELAY + 1)}
         )
 
+    def command(self, rng):
+        """Draws a command [3]: forward, sideways (m/s), and turning (rad/s)."""
+        return parts.command(rng, [0.0, -0.3, -0.5], [1.0, 0.3, 0.5], 0.1)
+
     def memory(self, rng, data):
         """Draws what an episode remembers at its start."""
         return {
             "actions": parts.history(jnp.zeros(NUM_SERVOS), LONGEST_DELAY + 1),
-            "command": parts.command(rng, [0.0, -0.3, -0.5], [1.0, 0.3, 0.5], 0.1),
+            "command": self.command(rng),
             "noise": jnp.zeros(NOISE.shape),
             "push": jnp.zeros(2),
             "step": 0,
@@ -93,10 +97,11 @@ class Full(Bare):
         """Returns what an episode remembers after an env step."""
         keys = jax.random.split(rng, 3)
         step = data.memory["step"] + 1
-        command = parts.command(keys[0], [0.0, -0.3, -0.5], [1.0, 0.3, 0.5], 0.1)
         return {
             "actions": parts.append(data.memory["actions"], action),
-            "command": jnp.where(parts.is_due(step, 250), command, data.memory["command"]),
+            "command": jax.lax.cond(
+                parts.is_due(step, 250), self.command, lambda key: data.memory["command"], keys[0]
+            ),
             "noise": parts.uniform_noise(keys[1], NOISE),
             "push": parts.push(keys[2], 0.5, parts.is_due(step, 200)),
             "step": step,

@@ -1,14 +1,14 @@
 """The kernels in which a team of lanes plays one episode after the other, or maps a function."""
 
+from collections.abc import Collection
 from typing import NamedTuple
-
-import numpy as np
 
 from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.gpu import cubin, loops
 from mjx_reinforce.engine.gpu.loops import StepArguments
 from mjx_reinforce.engine.gpu.source import WARP, Launch, Source
 from mjx_reinforce.engine.scalar import scalarized
+from mjx_reinforce.engine.scalar.nodes import Node, Scalar
 from mjx_reinforce.engine.team.text import CText
 
 #: Warps of a block where there are few episodes, whose threads have 128 registers each.
@@ -47,38 +47,29 @@ def player_text(program: scalarized.Scalarized, physics: Physics, num_actor: int
       num_actor: how many leaves of its arguments are the actor's.
     """
     arguments = loops.step_arguments(program, num_actor)
-    carried_leaves = [arguments.leaves[k] for k in arguments.carried]
-    words = [-(-leaf.size * leaf.itemsize // 4) for leaf in carried_leaves]
-    offsets = dict(zip(arguments.carried, np.cumsum([0, *words]).tolist(), strict=False))
-    text = CText(program, arguments.name, physics.skip)
     observation, action, rewards, (is_alive,), (is_broken,), *new_values = program.outputs
+    next_carries = dict(zip(arguments.carried, new_values, strict=True))
+    constants = [number for number, x in next_carries.items() if _is_argument(number, x)]
+    for number in constants:
+        del next_carries[number]
+    text = CText(program, arguments.name, physics.skip, constants)
+    record = [_record(text, "observation", observation), _record(text, "action", action)]
+    _carry_on(text, next_carries)
+    # What looks at all numbers, as these do, finds them in memory by now.
+    record.append(_record(text, "reward", rewards))  # the reward's terms are behind it
     text.line(f"const bool alive = {text.get(is_alive)} != 0;")
     text.line(f"const int is_broken = {text.get(is_broken)};")
-    record = []
-    records = [("observation", observation), ("action", action)]
-    if len(rewards) == 1:
-        record = [f"if (t.lane == 0) reward[row * episodes + column] = {text.get(rewards[0])};"]
-    else:  # the reward's terms are behind it
-        records.append(("reward", rewards))
-    record += [
-        f"EACH(i, {len(x)}) {field}[(row * {len(x)} + i) * episodes + column] = {text.array(x)}[i];"
-        for field, x in records
-    ]
-    # Only what the step reads is carried on. To compute a leaf may read others, which then are
-    # carried on, too: until no unwritten leaf is read.
-    next_carries = dict(zip(arguments.carried, new_values, strict=True))
-    while ready_inputs := sorted(next_carries.keys() & text.read):
-        for number in ready_inputs:
-            text.fill(f"out{number}", next_carries.pop(number))
-    pointers, initial = _carried_text(text, arguments, offsets)
+    _carry_on(text, next_carries)
+    carried = _Carried(text, arguments, constants)
     worker = loops.Worker(
         room=[
-            f"  Word *own = scratch, *following = scratch + {sum(words)};",
-            f"  scratch += 2 * {sum(words)};",
+            f"  Word *own = scratch, *following = scratch + {carried.words};",
+            f"  Word* const lasting = scratch + {2 * carried.words};",
+            f"  scratch += {2 * carried.words + carried.lasting_words};",
         ],
-        begin=initial,
+        begin=carried.begin,
         met=_waiting(text, "running"),
-        step=[*pointers, *text.lines],
+        step=[*carried.pointers, *text.lines],
         record=[
             *record,
             "      Word* const before = own;",
@@ -87,37 +78,85 @@ def player_text(program: scalarized.Scalarized, physics: Physics, num_actor: int
         steps="at",
     )
     loop = loops.play_loop(program, num_actor, worker, _SCRATCH)
-    return _source(physics, text, loop, 2 * sum(words) + text.words)
+    return _source(physics, text, loop, 2 * carried.words + carried.lasting_words + text.words)
 
 
-def _carried_text(
-    text: CText, arguments: StepArguments, offsets: dict[int, int]
-) -> tuple[list[str], list[str]]:
-    """Returns the pointers to the arguments that a step reads, and how an episode begins.
+def _is_argument(number: int, entries: list[Scalar]) -> bool:
+    """Returns whether an array is an argument as it came."""
+    places = [x.position for x in entries if isinstance(x, Node) and not x.op and not x.owner]
+    return places == [(number, k) for k in range(len(entries))]
 
-    A team has two copies of the state: a step reads ``own`` and writes ``following``, so that no
-    lane reads what another one has written already.
+
+def _record(text: CText, field: str, entries: list[Scalar]) -> str:
+    """Returns a line that records an array of a step."""
+    size = len(entries)
+    place = f"{field}[(row * {size} + i) * episodes + column]"
+    return f"EACH(i, {size}) {place} = {text.array(entries)}[i];"
+
+
+def _carry_on(text: CText, next_carries: dict[int, list[Scalar]]) -> None:
+    """Writes what the next step reads: the arguments that were read so far.
 
     Args:
       text: of the step.
-      arguments: the step's.
-      offsets: where each leaf of the state is in a copy, in words of 4 bytes.
+      next_carries: what the arguments are to be, by their numbers; those written are taken out.
     """
-    pointers = []
-    initial = []
-    for number in sorted(text.read & {*range(arguments.keys + 1)}):
-        leaf = arguments.leaves[number]
-        if number < arguments.num_actor:
+    # To compute one may read others, which then are carried on, too.
+    while ready_inputs := sorted(next_carries.keys() & text.read):
+        for number in ready_inputs:
+            text.keep(f"out{number}", next_carries.pop(number))
+
+
+class _Carried:
+    """What a step reads besides the actor, and what it hands on to the next step.
+
+    A team has two copies of it: a step reads ``own`` and writes ``following``, so that no lane
+    reads what another one has written already. What never changes in an episode is ``lasting``.
+
+    words: of 4 bytes of a copy
+    lasting_words: of what never changes
+    pointers: the lines that say where the arguments are
+    begin: the lines with which an episode begins
+    """
+
+    def __init__(self, text: CText, arguments: StepArguments, constants: Collection[int]):
+        """Gives each argument a place.
+
+        Args:
+          text: of the step.
+          arguments: the step's.
+          constants: the numbers of those that never change in an episode.
+        """
+        self.words = 0
+        self.lasting_words = 0
+        self.pointers: list[str] = []
+        self.begin: list[str] = []
+        for number in sorted(text.read & {*range(arguments.num_actor)}):
+            leaf = arguments.leaves[number]
             row = f"actor{number} + size_t(seed) * {leaf.size}"
-            pointers.append(f"const {leaf.type}* in{number} = {row};")
-            continue
-        place = f"reinterpret_cast<{leaf.type}*>({{}} + {offsets[number]})"
-        pointers.append(f"const {leaf.type}* in{number} = {place.format('own')};")
-        pointers.append(f"{leaf.type}* out{number} = {place.format('following')};")
+            self.pointers.append(f"const {leaf.type}* in{number} = {row};")
+        for number in sorted(text.read & {*arguments.carried}):
+            self._give_place(number, arguments, is_constant=number in constants)
+        for number in sorted(text.first_read):
+            leaf = arguments.leaves[number]
+            array, size = arguments.start(number)
+            self.begin.append(f"const {leaf.type}* in{number} = {array} + size_t(k) * {size};")
+        self.begin += text.first_lines
+
+    def _give_place(self, number: int, arguments: StepArguments, *, is_constant: bool) -> None:
+        leaf = arguments.leaves[number]
+        words = -(-leaf.size * leaf.itemsize // 4)
+        if is_constant:
+            first = f"reinterpret_cast<{leaf.type}*>(lasting + {self.lasting_words})"
+            self.lasting_words += words
+        else:
+            place = f"reinterpret_cast<{leaf.type}*>({{}} + {self.words})"
+            first = place.format("own")
+            self.pointers.append(f"{leaf.type}* out{number} = {place.format('following')};")
+            self.words += words
+        self.pointers.append(f"const {leaf.type}* in{number} = {first};")
         array, size = arguments.start(number)
-        source = f"{array}[size_t(k) * {size} + i]"
-        initial.append(f"EACH(i, {size}) {place.format('own')}[i] = {source};")
-    return pointers, initial
+        self.begin.append(f"EACH(i, {size}) {first}[i] = {array}[size_t(k) * {size} + i];")
 
 
 def mapping_text(program: scalarized.Scalarized, physics: Physics) -> Source:

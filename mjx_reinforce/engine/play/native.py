@@ -6,7 +6,6 @@ to rounding.
 """
 
 import functools
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -79,14 +78,17 @@ def native_rollout(
         shapes = _result_shapes(program, horizon, num_episodes)
         num_threads = jnp.int32(threads)
         outputs = cpu.call(program.code, shapes, limits, num_threads, words, *parameters, *starts)
+        observation, action, rewards, length, is_broken, simulated = outputs
+        rewards = rewards.reshape(horizon, num_episodes, 1 + len(program.terms))
+        reward, *term_rewards = jnp.unstack(rewards, axis=-1)
     else:
-        outputs = _episodes_before_numbers(
-            gpu.launch(program.code, program.record, horizon, limits, words, *parameters, *starts)
+        outputs = gpu.launch(
+            program.code, program.record, horizon, limits, words, *parameters, *starts
         )
-    observation, action, reward, length, is_broken, simulated = outputs
-    reward, *term_rewards = jnp.unstack(
-        reward.reshape(horizon, num_episodes, 1 + len(program.terms)), axis=-1
-    )
+        # Threads of a warp write the same number of neighboring episodes at once: [T, numbers, N].
+        observation, action, rewards, length, is_broken, simulated = outputs
+        observation, action = (jnp.swapaxes(x, 1, 2) for x in (observation, action))
+        reward, *term_rewards = jnp.unstack(rewards, axis=1)
     return Trajectory(
         observation=observation,
         action=action.reshape(horizon, num_episodes, *program.record[1].shape),
@@ -125,13 +127,6 @@ def against_key(key: jax.Array) -> str | None:
     if implementation == available.GENERATOR:
         return None
     return f"it draws noise as {available.GENERATOR} does, and the key is of {implementation}"
-
-
-def _episodes_before_numbers(outputs: Sequence[jax.Array]) -> Sequence[jax.Array]:
-    """Returns a kernel's results with the records' axes in the order that a CPU writes them in."""
-    # Threads of a warp write the same number of neighboring episodes at once: [T, numbers, N].
-    observation, action, reward = (jnp.swapaxes(x, 1, 2) for x in outputs[:3])
-    return observation, action, reward, *outputs[3:]
 
 
 def unsupported(

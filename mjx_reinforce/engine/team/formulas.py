@@ -4,7 +4,7 @@ Nothing is written here: see ``text``.
 """
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from mjx_reinforce.engine.scalar.nodes import Node, Scalar, is_constant
@@ -49,6 +49,41 @@ class Formulas:
                 self._number_of[node] = self._numbered(self._key(node))
         return self._number_of[scalar]
 
+    def siblings(
+        self, scalars: Iterable[Scalar], least: int, is_apart: Callable[[Node], bool]
+    ) -> list[Node]:
+        """Returns scalars of one formula among all that compute some, where that saves most.
+
+        Args:
+          scalars: what is to be computed.
+          least: how many operations each is to have for itself; fewer are not worth it.
+          is_apart: whether a node is computed, or to be computed, by other means.
+        """
+        families: dict[int, list[Node]] = {}
+        nodes = ancestors(scalars, is_apart)
+        for node in sorted(nodes, key=lambda node: node.index):
+            families.setdefault(self.number(node), []).append(node)
+        # What only computes as many siblings is part of their formula.
+        parts = {
+            self.number(operand)
+            for node in nodes
+            for operand in node.args
+            if operand in nodes
+            and len(families[self.number(operand)]) == len(families[self.number(node)])
+        }
+        most = 0
+        best: list[Node] = []
+        for number, family in families.items():
+            if len(family) > 1 and number not in parts:
+                first, second = (ancestors([node], is_apart) for node in family[:2])
+                length = len(second - first)
+                saved = (len(family) - 1) * length
+                is_independent = not ancestors(family[-1].args, is_apart).intersection(family)
+                if length >= least and saved > most and is_independent:
+                    most = saved
+                    best = family
+        return best
+
     def forget(self) -> None:
         """Forgets which formula a node is, where it is in memory from now on or no longer."""
         self._number_of.clear()
@@ -63,6 +98,25 @@ class Formulas:
 
     def _numbered(self, key: tuple) -> int:
         return self._numbers.setdefault(key, len(self._numbers))
+
+
+def ancestors(
+    scalars: Iterable[Scalar], is_apart: Callable[[Node], bool] = lambda node: False
+) -> set[Node]:
+    """Returns the nodes that compute scalars, themselves included.
+
+    Args:
+      scalars: what is computed.
+      is_apart: which nodes are left out, with what only they are computed from.
+    """
+    nodes = set()
+    stack = list(scalars)
+    while stack:
+        node = stack.pop()
+        if isinstance(node, Node) and node not in nodes and not is_apart(node):
+            nodes.add(node)
+            stack += node.args
+    return nodes
 
 
 def sum_terms(node: Node, num_reads: Counter[Node]) -> list[Scalar]:

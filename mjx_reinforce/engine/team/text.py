@@ -7,7 +7,7 @@ computed by the lanes together, where they are the same formula of other numbers
 
 import contextlib
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,11 +18,13 @@ from mjx_reinforce.engine.scalar.nodes import Call, Node, Scalar, identity, is_c
 from mjx_reinforce.engine.scalar.passes import liveness
 from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop, Schedule
 from mjx_reinforce.engine.team.cpp import Cpp, qualifier
-from mjx_reinforce.engine.team.formulas import Formulas, Place, sum_terms
+from mjx_reinforce.engine.team.formulas import Formulas, Place, ancestors, sum_terms
 from mjx_reinforce.engine.team.operations import expression, literal, type_of
 
 #: Fewer scalars of one formula are computed one by one.
 _MIN_RUN = 4
+#: Of a formula with so many operations, or more, the lanes compute any scalars together.
+_LONG = 24
 #: A sum of fewer terms is not worth a meeting of the lanes.
 _SHORT_SUM = 12
 
@@ -61,21 +63,33 @@ class CText(Cpp):
 
     words: how many words of 4 bytes ``scratch`` has, so far.
     read: the numbers of the arguments that were read, so far.
+    first_lines: what is computed once, before the first of many runs of ``lines``.
+    first_read: the numbers of the arguments that these lines read.
     reports: what the physics reports, by the names of ``device/state.h``.
     meets: how often teams meet: in the physics outside of branches and loops, as an expression.
     """
 
-    def __init__(self, program: scalarized.Scalarized, inputs: Callable[[int], str], steps: int):
+    def __init__(
+        self,
+        program: scalarized.Scalarized,
+        inputs: Callable[[int], str],
+        steps: int,
+        constants: Collection[int] = (),
+    ):
         """Says where what is not computed here is.
 
         Args:
           program: the program.
           inputs: the array of an argument by its number.
           steps: physics steps of a call of "physics".
+          constants: the numbers of the arguments that are the same in all runs.
         """
         super().__init__()
         self.words = 0
         self.read: set[int] = set()
+        self.first_lines: list[str] = []
+        self.first_read: set[int] = set()
+        self._constants = constants
         self.reports: list[str] = []
         self.meets = "0"
         self._depth = 0
@@ -105,25 +119,46 @@ class CText(Cpp):
             if stride == int(len(scalars) > 1):  # side by side; that of one scalar is 0
                 return f"({name} + {start})"
         array_id = self._reserve(scalars[0].dtype, len(scalars))
+        self.keep(array_id, scalars)
+        return array_id
+
+    def keep(self, array_id: str, scalars: Sequence[Scalar]) -> None:
+        """Writes scalars of the program into an array, from which others are computed then."""
         self.fill(array_id, scalars)
         self.line("t.sync();")
         self._read_from(array_id, scalars)
-        return array_id
 
     def fill(self, array_id: str, scalars: Sequence[Scalar]) -> None:
         """Writes scalars of the program into an array."""
         self._prepare(scalars)
-        # Neighbors of one formula are computed by the lanes together. All are grouped before any is
-        # written, as writing one changes what others are computed from.
-        runs = [list(run) for _, run in itertools.groupby(scalars, self._formulas.number)]
+        self._share(scalars)
         start = 0
-        for run in runs:
+        for run in self._runs(scalars):
             if len(run) < _MIN_RUN:
                 for k, x in enumerate(run, start=start):
                     self.line(f"if (t.lane == 0) {array_id}[{k}] = {self.value(x, self._values)};")
             else:
                 self._each(run, f"{array_id}[{start} + i] = {{}};")
             start += len(run)
+
+    def _runs(self, scalars: Sequence[Scalar]) -> list[list[Scalar]]:
+        """Returns neighbors of one formula, which the lanes may compute together."""
+        return [list(run) for _, run in itertools.groupby(scalars, self._formulas.number)]
+
+    def _share(self, scalars: Sequence[Scalar]) -> None:
+        """Has the lanes compute together, within some scalars, what costs much.
+
+        One by one, as writing some changes what others are computed from.
+        """
+        while siblings := self._formulas.siblings(scalars, _LONG, self._is_apart):
+            array_id = self._reserve(siblings[0].dtype, len(siblings))
+            self._each(siblings, f"{array_id}[i] = {{}};")
+            self.line("t.sync();")
+            self._read_from(array_id, siblings)
+
+    def _is_apart(self, node: Node) -> bool:
+        """Returns whether a node is computed already, or a sum that lanes share."""
+        return node in self._values or node in self._written or len(self._terms(node)) >= _SHORT_SUM
 
     def leaf(self, node: Node) -> str:
         """An input is read where it is used."""
@@ -263,6 +298,30 @@ class CText(Cpp):
         # A form may name an array of the body, which is not there any more.
         self._formulas.forget()
 
+    @contextlib.contextmanager
+    def _once(self, scalars: Sequence[Scalar]) -> Iterator[None]:
+        """Within this, lines are for the first run alone if some scalars are constants'."""
+        if not self._are_constant(scalars):
+            yield
+            return
+        outer_lines = self.lines
+        outer_read = self.read
+        self.lines = self.first_lines
+        self.read = self.first_read
+        with self._inside([], {}):
+            # What the runs have computed is not there yet.
+            self._values = {}
+            self._written = {}
+            self._formulas.forget()
+            yield
+        self.lines = outer_lines
+        self.read = outer_read
+
+    def _are_constant(self, scalars: Sequence[Scalar]) -> bool:
+        """Returns whether scalars are computed from nothing but constants."""
+        leaves = [x for x in ancestors(scalars) if x.op is None]
+        return all(x.owner is None and x.position[0] in self._constants for x in leaves)
+
     def _place(self, scalar: Scalar) -> Place | None:
         """Returns where an argument, a result of a call or an entry of an array is, or None."""
         if is_constant(scalar):
@@ -319,7 +378,8 @@ class CText(Cpp):
         # Where fields of the model are random, what is drawn of them comes last.
         for scalars in call.args[len(_INPUTS) :]:
             if scalars:
-                self.line(f"draw(M, s, {self.array(scalars)}, lane);")
+                with self._once(scalars):
+                    self.line(f"draw(M, s, {self.array(scalars)}, lane);")
         if self._simulates_once:
             self._read_from(_STATE["ctrl"], call.args[0])  # which the physics leaves as it is
         simulate, meetings = _SIMULATIONS[call.name]

@@ -199,7 +199,15 @@ def test_teams_show_sensors(teams):
 
 
 @pytest.mark.slow
-def test_teams_play_models_that_differ_from_episode_to_episode(teams):
+def test_teams_play_models_that_differ_from_episode_to_episode(teams, monkeypatch):
+    sources = []
+    write = team_kernel.player_text
+
+    def player_text(*arguments, num_actor):
+        sources.append(write(*arguments, num_actor=num_actor))
+        return sources[-1]
+
+    monkeypatch.setattr(team_kernel, "player_text", player_text)
     env = leg(RandomLeg, 40)
     actor, act, distribution = actor_and_act(env, (5,))
     want = played(native.native_rollout, env, (actor, act, distribution), num_seeds=2)
@@ -208,6 +216,11 @@ def test_teams_play_models_that_differ_from_episode_to_episode(teams):
     assert (engine.name, engine.why.partition(", ")[2]) == ("native", "16 lanes an episode")
     got = played(engine.rollout, env, (actor, act, distribution), num_seeds=2)
     assert {kernel.launch.lanes for kernel in made} == {16}
+    # What an episode draws of its model is drawn where it begins, and no step copies it.
+    (text,) = (source.text for source in sources if "t.meet(running)" in source.text)
+    begin, step = text.split("t.meet(running)")
+    assert begin.count("\ndraw(M, s, ") == 1
+    assert "draw(M, s, " not in step
     masses = want.observation[:, 0, :, -1].ravel()
     assert len(np.unique(masses)) == masses.size == 10  # the episodes of a kernel
     for name in ("observation", "reward"):
@@ -249,6 +262,23 @@ def test_teams_play_a_task_of_all_parts(teams):
     want = as_without_teams(teams, Robot(steps=20))
     commands = want.observation[:, 0, :, -1]
     assert len(np.unique(commands[commands != 0])) > 3
+
+
+def test_lanes_share_what_few_numbers_cost():
+    """Three numbers of thirty operations are computed by three lanes, whatever they are for."""
+
+    def parts(x):
+        for _ in range(30):
+            x = jnp.tanh(x)
+        return jnp.stack([x[0], jnp.sin(x[1]), x[2] * x[0]])
+
+    texts = []
+    for function in (parts, lambda x: parts(x)[1:2]):
+        traced = scalarized.trace(function, jnp.zeros(3))
+        written = scalarized.build(*traced, program.BRANCH_COST, program.SCANS)
+        physics = team_kernel.Physics("", far=0, skip=1, lanes=16, shared=0)
+        texts.append(team_kernel.mapping_text(written, physics).text)
+    assert [text.count("tanhf(") for text in texts] == [30, 30]
 
 
 def test_a_table_with_infinity_is_not_static():
