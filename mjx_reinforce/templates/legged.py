@@ -31,6 +31,7 @@ class _Pace(NamedTuple):
     forward, sideways, push: (m/s)
     turn: (rad/s)
     lift: of the robot's height
+    weights: of the reward's first four terms: upright, and the errors of the three numbers
     """
 
     forward: float
@@ -38,10 +39,16 @@ class _Pace(NamedTuple):
     turn: float
     push: float
     lift: float
+    weights: tuple[float, float, float, float]
 
 
-_ON_FOUR = _Pace(forward=1.0, sideways=0.3, turn=0.5, push=0.5, lift=0.2)
-_ON_TWO = _Pace(forward=0.4, sideways=0.1, turn=0.3, push=0.2, lift=0.12)
+_ON_FOUR = _Pace(
+    forward=1.0, sideways=0.3, turn=0.5, push=0.5, lift=0.2, weights=(2.0, -1.0, -1.0, -1.5)
+)
+#: Slow commands err by little: with the weights of four feet, a robot stands.
+_ON_TWO = _Pace(
+    forward=0.4, sideways=0.1, turn=0.3, push=0.2, lift=0.12, weights=(3.0, -4.0, -3.0, -2.0)
+)
 _HOME_OF_CONTROLS = """\
         self.home = self.mj_model.key_ctrl[0]
 """
@@ -137,6 +144,10 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
             sideways=pace.sideways,
             turn=pace.turn,
             push=pace.push,
+            upright=pace.weights[0],
+            forward_error=pace.weights[1],
+            sideways_error=pace.weights[2],
+            turn_error=pace.weights[3],
             lift=_lift(model),
             lowest=round(_floor(model) + _LOWEST * height, 3),
             nu=model.nu,
