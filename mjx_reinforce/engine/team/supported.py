@@ -16,9 +16,9 @@ _C: Any = mujoco  # a C extension without stubs
 #: MuJoCo's mjtJoint.
 FREE, BALL, SLIDE, HINGE = range(4)
 #: MuJoCo's mjtGeom.
-PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = (
+PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = (
     int(getattr(_C.mjtGeom, f"mjGEOM_{name}"))
-    for name in ("PLANE", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX")
+    for name in ("PLANE", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH")
 )
 #: Bits of a mask of degrees of freedom, of which the widest is an unsigned long long.
 MAX_DOFS = 64
@@ -37,6 +37,7 @@ NUM_PARTS = {
     (CAPSULE, CAPSULE): 1,
     (PLANE, CAPSULE): 2,
     (CAPSULE, BOX): 2,
+    (PLANE, MESH): 3,
     (PLANE, BOX): 4,
     (PLANE, CYLINDER): 4,
     (BOX, BOX): 8,

@@ -17,7 +17,7 @@ from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.physics import sensors
 from mjx_reinforce.engine.physics.early_stop import stops_early
 from mjx_reinforce.engine.scalar import UnsupportedPrimitive
-from mjx_reinforce.engine.team import cables, draws, flags, last_pass, records, supported
+from mjx_reinforce.engine.team import cables, draws, flags, hulls, last_pass, records, supported
 from mjx_reinforce.engine.team.contact_kinds import (
     MIN_VALUE,
     ContactKind,
@@ -34,6 +34,7 @@ from mjx_reinforce.engine.team.supported import (
     ELLIPSOID,
     FREE,
     HINGE,
+    MESH,
     PLANE,
     SLIDE,
     SPHERE,
@@ -59,6 +60,7 @@ _HEADERS = [
     "rounds",
     "boxes",
     "cylinders",
+    "hulls",
     "two_boxes",
     "collision",
     "equality",
@@ -77,7 +79,7 @@ NUM_NEAR = 8
 #: How a degree of freedom moves what it carries, by ``device/kinematics.h``.
 _TURNS, _SHIFTS, _SHIFTS_IN_THE_WORLD = range(3)
 #: Geoms by the enum of ``device/rounds.h``.
-_GEOM_KINDS = {PLANE: 0, SPHERE: 1, CAPSULE: 1, BOX: 2, CYLINDER: 3, ELLIPSOID: 4}
+_GEOM_KINDS = {PLANE: 0, SPHERE: 1, CAPSULE: 1, ELLIPSOID: 2, CYLINDER: 3, BOX: 4, MESH: 5}
 _NO_LIMIT = 1e30
 
 
@@ -135,6 +137,7 @@ class _Tables:
     ints, masks, reals: the arrays of the struct Model, which the lanes read
     soft: the rows of the softnesses that were met, with their numbers
     random: the names of fields that differ from episode to episode
+    hulls: of the meshes that may meet something
     layout: of the tables that such fields change
     """
 
@@ -191,6 +194,7 @@ class _Tables:
             table = ", ".join(str(int(x)) for x in values) or "0"
             lines.append(f"DEV constexpr int {name}(int i) {{")
             lines.append(f"  constexpr int table[] = {{{table}}};\n  return table[i];\n}}")
+        lines += hulls.text(self.hulls)
         lines.append("struct Fixed {")
         lines.append("  real timestep, smallest_gain;")
         empty = []
@@ -698,8 +702,9 @@ class _Tables:
                 # Of an edge of the pyramid, which pushes along a tangent, too.
                 friction = kind.friction[0]
                 weight *= 2 * friction**2 / model.opt.impratio * (1 + friction**2)
-            flat, other = geom_types = supported.geom_kinds(model, pair)
-            kind_pairs |= 1 << (8 * _GEOM_KINDS[flat] + _GEOM_KINDS[other])
+            geom_types = supported.geom_kinds(model, pair)
+            flat, other = (_GEOM_KINDS[x] for x in geom_types)
+            kind_pairs |= 1 << (other * (other + 1) // 2 + flat)
             for part in range(supported.NUM_PARTS[geom_types]):
                 items.append(records.packed_item(geom_ids[pair.geom1], geom_ids[pair.geom2], part))
                 item_kinds.append(number)
@@ -756,10 +761,14 @@ class _Tables:
         self.reals["geom_half"] = np.where(has_length, size[:, 1], 0)
         self.reals["geom_reach"] = model.geom_rbound[geoms]
         # Shared memory is scarce: what has no turn about the axis needs neither that nor sizes.
-        self.reals["geom_turn"] = []
-        self.reals["geom_size"] = []
-        if np.isin(types, (BOX, CYLINDER, ELLIPSOID)).any():
-            self.reals |= {"geom_turn": turns, "geom_size": size}
+        has_size = np.isin(types, (BOX, CYLINDER, ELLIPSOID)).any()
+        has_meshes = MESH in types
+        self.reals["geom_turn"] = turns if has_size or has_meshes else []
+        self.reals["geom_size"] = size if has_size else []
+        self.hulls = hulls.of_geoms(model, geoms)
+        meshes = model.geom_dataid[geoms]
+        numbers = [self.hulls.numbers.get(int(x), -1) for x in meshes]
+        self.ints["geom_hull"] = numbers if has_meshes else []
 
     def _sensors(self) -> None:
         """Makes the tables of sensors of touch."""

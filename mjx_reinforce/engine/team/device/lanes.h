@@ -4,6 +4,7 @@
 #define DEV __device__ __forceinline__
 #define UNROLL _Pragma("unroll")
 #define LOOP _Pragma("unroll 1")
+#define TABLE static __device__ const
 typedef float real;
 #else
 #include <cmath>
@@ -12,6 +13,7 @@ typedef float real;
 #define DEV inline
 #define UNROLL
 #define LOOP
+#define TABLE static const
 #ifndef REAL
 #define REAL double
 #endif

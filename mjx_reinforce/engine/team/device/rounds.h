@@ -1,9 +1,12 @@
 // Contacts of spheres, capsules and planes.
 #pragma once
 
-enum { PLANE, ROUND, BOX, CYLINDER, ELLIPSOID };  // geoms; round are spheres and capsules
-// Whether the model has two such geoms that may meet.
-DEV constexpr bool may_meet(int flat, int other) { return KIND_PAIRS >> (8 * flat + other) & 1; }
+// Geoms in MuJoCo's order; round are spheres and capsules.
+enum { PLANE, ROUND, ELLIPSOID, CYLINDER, BOX, MESH };
+// Whether the model has two such geoms that may meet; the flatter one comes first in that order.
+DEV constexpr bool may_meet(int flat, int other) {
+  return KIND_PAIRS >> (other * (other + 1) / 2 + flat) & 1;
+}
 
 struct Touch {
   real distance, at[3], normal[3], tangent[3];
