@@ -22,7 +22,7 @@ class Hulls(NamedTuple):
     vertex_neighbors, vertex_faces: [V] where a vertex's list begins
     neighbors, faces: such lists, of vertices and of faces, each up to ``_END``
     face_normals: [F, 3]
-    face_vertices: [F] where a face's list begins in ``corners``
+    face_corners: [F, 2] where a face's list begins, and how many corners it has
     corners: such lists, of vertices in their order around a face
     hulls: [H, 29] first vertex, how many are searched one by one, the vertices to climb from
     numbers: the number of the hull of each mesh that a geom has
@@ -34,7 +34,7 @@ class Hulls(NamedTuple):
     neighbors: list[int]
     faces: list[int]
     face_normals: list[Sequence[float]]
-    face_vertices: list[int]
+    face_corners: list[tuple[int, int]]
     corners: list[int]
     hulls: list[Sequence[int]]
     numbers: dict[int, int]
@@ -74,7 +74,7 @@ def _add(hulls: Hulls, model: Any, mesh: int, places: np.ndarray, graph: np.ndar
     is_searched = len(places) < _MIN_CLIMBED
     vertices = range(len(places)) if is_searched else mesh_ids.tolist()
     first = len(hulls.places)
-    first_face = len(hulls.face_vertices)
+    first_face = len(hulls.face_corners)
     number_of = {x: first + n for n, x in enumerate(vertices)}
     for vertex in vertices:
         hulls.places.append(places[vertex])
@@ -89,9 +89,9 @@ def _add(hulls: Hulls, model: Any, mesh: int, places: np.ndarray, graph: np.ndar
         hulls.faces.extend([*(first_face + row), _END])
     for face in model.mesh_polyadr[mesh] + np.arange(model.mesh_polynum[mesh]):
         hulls.face_normals.append(model.mesh_polynormal[face])
-        hulls.face_vertices.append(len(hulls.corners))
         row = model.mesh_polyvert[model.mesh_polyvertadr[face] :][: model.mesh_polyvertnum[face]]
-        hulls.corners.extend([*(number_of[int(x)] for x in row), _END])
+        hulls.face_corners.append((len(hulls.corners), len(row)))
+        hulls.corners.extend(number_of[int(x)] for x in row)
     seeds = [number_of[int(mesh_ids[x])] for x in model.mesh_extrema[mesh]]
     hulls.hulls.append((first, len(places) if is_searched else 0, *seeds))
 
@@ -105,8 +105,8 @@ def text(hulls: Hulls) -> list[str]:
         )
     ]
     faces = [
-        f"{{{{{','.join(f'real({float(x)!r})' for x in normal)}}},{start}}}"
-        for normal, start in zip(hulls.face_normals, hulls.face_vertices, strict=True)
+        f"{{{{{','.join(f'real({float(x)!r})' for x in normal)}}},{start},{count}}}"
+        for normal, (start, count) in zip(hulls.face_normals, hulls.face_corners, strict=True)
     ]
     rows = [
         f"{{{first},{count},{{{','.join(map(str, seeds))}}}}}"

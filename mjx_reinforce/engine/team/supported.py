@@ -37,7 +37,7 @@ NUM_PARTS = {
     (CAPSULE, CAPSULE): 1,
     (PLANE, CAPSULE): 2,
     (CAPSULE, BOX): 2,
-    (PLANE, MESH): 3,
+    (PLANE, MESH): 4,
     (PLANE, BOX): 4,
     (PLANE, CYLINDER): 4,
     (BOX, BOX): 8,

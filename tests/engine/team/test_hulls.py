@@ -51,10 +51,9 @@ def test_faces_hold_their_corners():
     tables = hulls.of_geoms(m, [2])
     places = np.array(tables.places)
     assert len(tables.face_normals) == 6
-    for face, (normal, start) in enumerate(
-        zip(tables.face_normals, tables.face_vertices, strict=True)
-    ):
-        corners = tables.corners[start : tables.corners.index(-1, start)]
+    rows = zip(tables.face_normals, tables.face_corners, strict=True)
+    for face, (normal, (start, count)) in enumerate(rows):
+        corners = tables.corners[start : start + count]
         heights = places @ normal
         assert np.isclose(heights[corners], heights.max(), atol=1e-6).all()
         for corner in corners:
