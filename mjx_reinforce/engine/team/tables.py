@@ -66,6 +66,7 @@ _HEADERS = [
     "equality",
     "elimination",
     "newton",
+    "islands",
     "early_stop",
     "touch",
     "report",
@@ -245,7 +246,17 @@ class _Tables:
         self.constants["STEPS"] = model.opt.iterations
         self.constants["LENGTHS"] = model.opt.ls_iterations
         self.constants["WARM"] = not flags.is_off(model, "warmstart")
-        self.constants["ONE_ISLAND"] = flags.is_off(model, "island")
+        is_one = flags.is_off(model, "island")
+        self.constants["ONE_ISLAND"] = is_one
+        # The degrees of freedom of each tree, where C solves the trees that rows join apart.
+        trees = np.asarray(model.dof_treeid)
+        masks = [sum(1 << int(dof) for dof in np.flatnonzero(trees == x)) for x in sorted({*trees})]
+        has_islands = stops_early(model) and not is_one and len(masks) > 1
+        self.constants["NTREES"] = len(masks) if has_islands else 1
+        fixed_links = [0] * (1 + model.nmocap)
+        links = [masks[trees[dof]] for dof in model.jnt_dofadr] + fixed_links
+        self.masks["tree_dofs"] = masks if has_islands else []
+        self.masks["link_tree"] = links if has_islands else []
         self.real_constants["TOLERANCE"] = float(model.opt.tolerance)
         self.real_constants["LENGTH_TOLERANCE"] = float(model.opt.ls_tolerance)
         self.real_constants["MEAN_TRACE"] = float(model.stat.meaninertia * model.nv)
