@@ -90,7 +90,10 @@ def _lacking_options(model: Any) -> Iterable[tuple[str, Any]]:
     limits = f"few iterations of its solver ({opt.iterations}, {opt.ls_iterations} along a line)"
     yield f"{limits} under Runge-Kutta", is_early and opt.integrator == types.mjINT_RK4
     yield "flags that enable parts of the physics", flags.enabled_physics(model)
-    yield "noslip iterations", opt.noslip_iterations
+    has_noslip = opt.noslip_iterations > 0
+    yield f"{limits} and noslip iterations", is_early and has_noslip
+    pulls = model.ntendon and np.any(model.tendon_frictionloss)
+    yield "noslip iterations and friction loss of tendons", has_noslip and pulls
     has_medium = opt.density > 0 or opt.viscosity > 0
     is_fast = opt.integrator == types.mjINT_IMPLICITFAST
     yield "a medium under implicitfast", has_medium and is_fast

@@ -68,6 +68,7 @@ _HEADERS = [
     "newton",
     "islands",
     "early_stop",
+    "no_slip",
     "touch",
     "report",
     "free_bodies",
@@ -248,10 +249,13 @@ class _Tables:
         self.constants["WARM"] = not flags.is_off(model, "warmstart")
         is_one = flags.is_off(model, "island")
         self.constants["ONE_ISLAND"] = is_one
+        self.constants["NOSLIP"] = model.opt.noslip_iterations
+        self.real_constants["NOSLIP_TOLERANCE"] = float(model.opt.noslip_tolerance)
         # The degrees of freedom of each tree, where C solves the trees that rows join apart.
         trees = np.asarray(model.dof_treeid)
         masks = [sum(1 << int(dof) for dof in np.flatnonzero(trees == x)) for x in sorted({*trees})]
-        has_islands = stops_early(model) and not is_one and len(masks) > 1
+        is_approximate = stops_early(model) or model.opt.noslip_iterations > 0
+        has_islands = is_approximate and not is_one and len(masks) > 1
         self.constants["NTREES"] = len(masks) if has_islands else 1
         fixed_links = [0] * (1 + model.nmocap)
         links = [masks[trees[dof]] for dof in model.jnt_dofadr] + fixed_links
