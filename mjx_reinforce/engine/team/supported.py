@@ -118,8 +118,8 @@ def _lacking_parts(model: Any) -> Iterable[tuple[str, Any]]:
     yield "tendons with a range of actuators' forces", np.any(model.tendon_actfrclimited)
     yield "joints that yield", np.any(model.jnt_springyield)
     active = model.eq_type[np.asarray(model.eq_active0, bool)]
-    equalities = (_C.mjtEq.mjEQ_CONNECT, _C.mjtEq.mjEQ_JOINT)
-    yield "equalities other than connect and joint", not np.isin(active, equalities).all()
+    equalities = (_C.mjtEq.mjEQ_CONNECT, _C.mjtEq.mjEQ_WELD, _C.mjtEq.mjEQ_JOINT)
+    yield "equalities other than connect, weld and joint", not np.isin(active, equalities).all()
 
 
 def _lacking_actuators(model: Any) -> Iterable[tuple[str, Any]]:

@@ -637,28 +637,45 @@ class _Tables:
         """Makes the tables of equality constraints."""
         model = self.model
         eq_kinds = np.where(model.eq_active0, model.eq_type, -1)
+        weld_eqs = np.flatnonzero(eq_kinds == _C.mjtEq.mjEQ_WELD)
         connect_eqs = np.flatnonzero(eq_kinds == _C.mjtEq.mjEQ_CONNECT)
+        connect_eqs = np.concatenate([connect_eqs, weld_eqs])
         joint_eqs = np.flatnonzero(eq_kinds == _C.mjtEq.mjEQ_JOINT)
         self.constants["NCONNECT"] = len(connect_eqs)
-        self.constants["NE"] = 3 * len(connect_eqs) + len(joint_eqs)
+        self.constants["NWELD"] = len(weld_eqs)
+        self.constants["NE"] = 3 * len(connect_eqs) + 3 * len(weld_eqs) + len(joint_eqs)
         links = []
+        turns = []
         places = []
         bodies = []
         for equality in connect_eqs:
             ends = (model.eq_obj1id[equality], model.eq_obj2id[equality])
             anchors = model.eq_data[equality, :6].reshape(2, 3)
+            # A weld has them the other way around, and a relative pose.
+            is_weld = model.eq_type[equality] == _C.mjtEq.mjEQ_WELD
+            quats = np.array([model.eq_data[equality, 6:10], [1, 0, 0, 0]])
+            if is_weld:
+                anchors = anchors[::-1]
             # Between sites there are no anchors in eq_data: the sites are.
             if model.eq_objtype[equality] == _C.mjtObj.mjOBJ_SITE:
                 anchors = model.site_pos[list(ends)]
+                quats = model.site_quat[list(ends)]
                 ends = model.site_bodyid[list(ends)]
             frames = [self.frames[body] for body in ends]
             bodies.append([int(body) for body in ends])
             links.append([self._link_number(frame.link) for frame in frames])
             places.append([frame.place(x) for frame, x in zip(frames, anchors, strict=True)])
+            if is_weld:
+                ends_quats = [times(x.quat, quat) for x, quat in zip(frames, quats, strict=True)]
+                turns.append([rotation(quat) for quat in ends_quats])
         self.ints["connect_link"] = links
         self.ints["connect_body"] = bodies
         self.reals["connect_at"] = places
         self.reals["connect_weight"] = [model.body_invweight0[x, 0].sum() for x in bodies]
+        weld_bodies = bodies[len(bodies) - len(weld_eqs) :]
+        self.reals["weld_turn"] = turns
+        self.reals["weld_scale"] = model.eq_data[weld_eqs, 10]
+        self.reals["weld_weight"] = [model.body_invweight0[x, 1].sum() for x in weld_bodies]
         self.ints["connect_soft"] = self._equality_softs(connect_eqs)
         # A joint alone is held at a value: its second is -1.
         joints = np.stack([model.eq_obj1id[joint_eqs], model.eq_obj2id[joint_eqs]], 1)

@@ -200,6 +200,7 @@ def test_a_search_that_stops_early_ends_where_c_ends(limits, tmp_path):
         "spatial tendons",
         "limits and friction loss of tendons",
         "a tendon between two trees, implicitfast",
+        "weld of two bodies",
         *_OF_MOCAP,
     ],
 )
