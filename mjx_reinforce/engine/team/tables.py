@@ -34,6 +34,7 @@ from mjx_reinforce.engine.team.supported import (
     ELLIPSOID,
     FREE,
     HINGE,
+    MESH,
     PLANE,
     SLIDE,
     SPHERE,
@@ -60,6 +61,10 @@ _HEADERS = [
     "boxes",
     "cylinders",
     "two_boxes",
+    "support",
+    "gjk",
+    "epa",
+    "convex",
     "collision",
     "equality",
     "elimination",
@@ -77,7 +82,7 @@ NUM_NEAR = 8
 #: How a degree of freedom moves what it carries, by ``device/kinematics.h``.
 _TURNS, _SHIFTS, _SHIFTS_IN_THE_WORLD = range(3)
 #: Geoms by the enum of ``device/rounds.h``.
-_GEOM_KINDS = {PLANE: 0, SPHERE: 1, CAPSULE: 1, BOX: 2, CYLINDER: 3, ELLIPSOID: 4}
+_GEOM_KINDS = {PLANE: 0, SPHERE: 1, CAPSULE: 1, ELLIPSOID: 2, CYLINDER: 3, BOX: 4, MESH: 5}
 _NO_LIMIT = 1e30
 
 
@@ -109,7 +114,7 @@ def far_words(mj_model: MjModel, num_near: int = NUM_NEAR, random: Collection[st
     sizes = _Tables(mj_model, num_near, random).constants
     # The Contact of state.h.
     contact_words = 13 + 5 * sizes["CD"] + sizes["ELLIPTIC"] + 5 * sizes["DRAWS_FRICTION"]
-    words = max(0, int(sizes["NI"] - sizes["NEAR"])) * int(contact_words)
+    words = max(0, int(sizes["NC"] - sizes["NEAR"])) * int(contact_words)
     return words + words % 2  # numbers of 8 bytes may follow
 
 
@@ -686,6 +691,8 @@ class _Tables:
         has_friction = "geom_friction" in self.random
         kind_numbers: dict[tuple[ContactKind, int], int] = {}
         kind_pairs = 0
+        convex_kinds = 0
+        convex_contacts = []
         items = []
         item_kinds = []
         weights = []
@@ -698,9 +705,14 @@ class _Tables:
                 # Of an edge of the pyramid, which pushes along a tangent, too.
                 friction = kind.friction[0]
                 weight *= 2 * friction**2 / model.opt.impratio * (1 + friction**2)
-            flat, other = geom_types = supported.geom_kinds(model, pair)
-            kind_pairs |= 1 << (8 * _GEOM_KINDS[flat] + _GEOM_KINDS[other])
-            for part in range(supported.NUM_PARTS[geom_types]):
+            geom_types = supported.geom_kinds(model, pair)
+            flat, other = (_GEOM_KINDS[x] for x in geom_types)
+            kind_pairs |= 1 << (other * (other + 1) // 2 + flat)
+            if geom_types in supported.CONVEX_CONTACTS:
+                convex_kinds |= 1 << flat | 1 << other
+                convex_contacts.append(supported.CONVEX_CONTACTS[geom_types])
+            # The convex collider finds all contacts of a pair at once.
+            for part in range(supported.NUM_PARTS.get(geom_types, 1)):
                 items.append(records.packed_item(geom_ids[pair.geom1], geom_ids[pair.geom2], part))
                 item_kinds.append(number)
                 weights.append(weight)
@@ -729,7 +741,14 @@ class _Tables:
             self.ints["kind_soft_friction"] = [self._number(x.friction_softness) for x in kinds]
         self.constants["KIND_PAIRS"] = kind_pairs
         self.constants["NI"] = len(items)
-        self.constants["NEAR"] = max(1, min(num_near, len(items)))
+        num_contacts = len(items) + sum(convex_contacts) - len(convex_contacts)
+        self.constants["NC"] = num_contacts
+        self.constants["NEAR"] = max(1, min(num_near, num_contacts))
+        self.constants["CONVEX_KINDS"] = convex_kinds
+        self.constants["CONVEX_CONTACTS"] = max(convex_contacts, default=0)
+        self.constants["CONVEX_STEPS"] = model.opt.ccd_iterations
+        self.real_constants["CONVEX_TOLERANCE"] = float(model.opt.ccd_tolerance)
+        self.reals["kind_gap"] = [x.gap for x in kinds] if convex_contacts else []
         self.constants["CD"] = max((x.dim for x in kinds), default=1)
         self.constants["NG"] = max(len(geoms), 1)
         self._geoms(self.geoms)
