@@ -37,6 +37,7 @@ NUM_PARTS = {
     (CAPSULE, CAPSULE): 1,
     (PLANE, CAPSULE): 2,
     (CAPSULE, BOX): 2,
+    (PLANE, MESH): 4,
     (PLANE, BOX): 4,
     (PLANE, CYLINDER): 4,
     (BOX, BOX): 8,
@@ -94,15 +95,15 @@ def _lacking_options(model: Any) -> Iterable[tuple[str, Any]]:
     integrators = (types.mjINT_EULER, types.mjINT_RK4, types.mjINT_IMPLICITFAST)
     yield "an integrator other than Euler, RK4 and implicitfast", opt.integrator not in integrators
     yield "a solver other than Newton", opt.solver != _C.mjtSolver.mjSOL_NEWTON
-    # Where C stops early it does so in each island, and in each stage.
+    # Where C stops early it does so in each stage.
     is_early = stops_early(model)
-    num_trees = len(set(np.asarray(model.dof_treeid)))
-    has_islands = num_trees > 1 and not flags.is_off(model, "island")
     limits = f"few iterations of its solver ({opt.iterations}, {opt.ls_iterations} along a line)"
-    yield f"{limits} for {num_trees} kinematic trees", is_early and has_islands
     yield f"{limits} under Runge-Kutta", is_early and opt.integrator == types.mjINT_RK4
     yield "flags that enable parts of the physics", flags.enabled_physics(model)
-    yield "noslip iterations", opt.noslip_iterations
+    has_noslip = opt.noslip_iterations > 0
+    yield f"{limits} and noslip iterations", is_early and has_noslip
+    pulls = model.ntendon and np.any(model.tendon_frictionloss)
+    yield "noslip iterations and friction loss of tendons", has_noslip and pulls
     has_medium = opt.density > 0 or opt.viscosity > 0
     is_fast = opt.integrator == types.mjINT_IMPLICITFAST
     yield "a medium under implicitfast", has_medium and is_fast

@@ -17,7 +17,7 @@ from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.physics import sensors
 from mjx_reinforce.engine.physics.early_stop import stops_early
 from mjx_reinforce.engine.scalar import UnsupportedPrimitive
-from mjx_reinforce.engine.team import cables, draws, flags, last_pass, records, supported
+from mjx_reinforce.engine.team import cables, draws, flags, hulls, last_pass, records, supported
 from mjx_reinforce.engine.team.contact_kinds import (
     MIN_VALUE,
     ContactKind,
@@ -60,6 +60,7 @@ _HEADERS = [
     "rounds",
     "boxes",
     "cylinders",
+    "hulls",
     "two_boxes",
     "support",
     "gjk",
@@ -69,7 +70,9 @@ _HEADERS = [
     "equality",
     "elimination",
     "newton",
+    "islands",
     "early_stop",
+    "no_slip",
     "touch",
     "report",
     "free_bodies",
@@ -140,6 +143,7 @@ class _Tables:
     ints, masks, reals: the arrays of the struct Model, which the lanes read
     soft: the rows of the softnesses that were met, with their numbers
     random: the names of fields that differ from episode to episode
+    hulls: of the meshes that may meet something
     layout: of the tables that such fields change
     """
 
@@ -196,6 +200,7 @@ class _Tables:
             table = ", ".join(str(int(x)) for x in values) or "0"
             lines.append(f"DEV constexpr int {name}(int i) {{")
             lines.append(f"  constexpr int table[] = {{{table}}};\n  return table[i];\n}}")
+        lines += hulls.text(self.hulls)
         lines.append("struct Fixed {")
         lines.append("  real timestep, smallest_gain;")
         empty = []
@@ -246,7 +251,20 @@ class _Tables:
         self.constants["STEPS"] = model.opt.iterations
         self.constants["LENGTHS"] = model.opt.ls_iterations
         self.constants["WARM"] = not flags.is_off(model, "warmstart")
-        self.constants["ONE_ISLAND"] = flags.is_off(model, "island")
+        is_one = flags.is_off(model, "island")
+        self.constants["ONE_ISLAND"] = is_one
+        self.constants["NOSLIP"] = model.opt.noslip_iterations
+        self.real_constants["NOSLIP_TOLERANCE"] = float(model.opt.noslip_tolerance)
+        # The degrees of freedom of each tree, where C solves the trees that rows join apart.
+        trees = np.asarray(model.dof_treeid)
+        masks = [sum(1 << int(dof) for dof in np.flatnonzero(trees == x)) for x in sorted({*trees})]
+        is_approximate = stops_early(model) or model.opt.noslip_iterations > 0
+        has_islands = is_approximate and not is_one and len(masks) > 1
+        self.constants["NTREES"] = len(masks) if has_islands else 1
+        fixed_links = [0] * (1 + model.nmocap)
+        links = [masks[trees[dof]] for dof in model.jnt_dofadr] + fixed_links
+        self.masks["tree_dofs"] = masks if has_islands else []
+        self.masks["link_tree"] = links if has_islands else []
         self.real_constants["TOLERANCE"] = float(model.opt.tolerance)
         self.real_constants["LENGTH_TOLERANCE"] = float(model.opt.ls_tolerance)
         self.real_constants["MEAN_TRACE"] = float(model.stat.meaninertia * model.nv)
@@ -775,10 +793,14 @@ class _Tables:
         self.reals["geom_half"] = np.where(has_length, size[:, 1], 0)
         self.reals["geom_reach"] = model.geom_rbound[geoms]
         # Shared memory is scarce: what has no turn about the axis needs neither that nor sizes.
-        self.reals["geom_turn"] = []
-        self.reals["geom_size"] = []
-        if np.isin(types, (BOX, CYLINDER, ELLIPSOID)).any():
-            self.reals |= {"geom_turn": turns, "geom_size": size}
+        has_size = np.isin(types, (BOX, CYLINDER, ELLIPSOID)).any()
+        has_meshes = MESH in types
+        self.reals["geom_turn"] = turns if has_size or has_meshes else []
+        self.reals["geom_size"] = size if has_size else []
+        self.hulls = hulls.of_geoms(model, geoms)
+        meshes = model.geom_dataid[geoms]
+        numbers = [self.hulls.numbers.get(int(x), -1) for x in meshes]
+        self.ints["geom_hull"] = numbers if has_meshes else []
 
     def _sensors(self) -> None:
         """Makes the tables of sensors of touch."""

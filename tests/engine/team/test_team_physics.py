@@ -210,6 +210,22 @@ def test_lanes_share_cables_and_mocap_bodies(feature, lanes, tmp_path):
 
 @needs_compiler
 @pytest.mark.slow
+@pytest.mark.parametrize("feature", [x for x in _MODELS["features"] if x.startswith("no slip")])
+def test_lanes_share_friction_without_slip(feature, tmp_path):
+    m = _model(**_MODELS["features"][feature])
+    assert _largest_error(_exact(m), tmp_path, skip=3, starts=1, lanes=8) < 1e-9
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("limits", [x for x in _MODELS["early"] if "that" in x])
+def test_lanes_share_islands(limits, tmp_path):
+    m = _model(**_MODELS["early"][limits])
+    assert _largest_error(m, tmp_path, skip=3, starts=1, lanes=8) < 1e-9
+
+
+@needs_compiler
+@pytest.mark.slow
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
 def test_a_quadruped_that_takes_few_steps(cone, tmp_path):
     spec = _C.MjSpec.from_file(f"{_OWN}.xml")

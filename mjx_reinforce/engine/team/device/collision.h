@@ -23,6 +23,8 @@ DEV Touch touch_of(const Model& M, const State& s, int item, real margin) {
     touch_sphere_and_cylinder(M, s, a, b, c);
   } else if (are(PLANE, ELLIPSOID)) {
     touch_ellipsoid_on_plane(M, s, a, b, c);
+  } else if (are(PLANE, MESH)) {
+    touch_hull_on_plane(M, s, a, b, part, margin, c);
   } else if (below == PLANE) {
     const Quad q = s.geom_place[b], axis = s.geom_axis[b];
     const real half = M.geom_half[b], along = part ? -half : half;

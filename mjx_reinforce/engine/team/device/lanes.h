@@ -5,6 +5,7 @@
 #define CALL static __device__ __noinline__
 #define UNROLL _Pragma("unroll")
 #define LOOP _Pragma("unroll 1")
+#define TABLE static __device__ const
 typedef float real;
 #else
 #include <cmath>
@@ -14,6 +15,7 @@ typedef float real;
 #define CALL static inline
 #define UNROLL
 #define LOOP
+#define TABLE static const
 #ifndef REAL
 #define REAL double
 #endif

@@ -53,3 +53,20 @@ struct FluidBody {
 struct Compensation { real moment[3], mass; };
 // Along the two tangents, about the normal, about the two tangents.
 struct Friction { real along[5]; };
+
+// The hull of a mesh, in memory that all teams read (hulls.py). What has no room in a struct is a
+// list from its place in hull_neighbor, hull_faces_of or hull_corner on; the first two end with -1.
+// These number vertices and faces across all hulls.
+struct alignas(16) HullVertex {
+  float at[3];            // in the frame of the mesh, which MuJoCo has in float32, too (m)
+  int neighbors;          // of hull_neighbor, in MuJoCo's order
+  int faces;              // of hull_faces_of
+};
+struct HullFace {
+  real normal[3];
+  int corners, count;     // of hull_corner, in order around the face, and how many
+};
+struct Hull {
+  int first, searched;    // a vertex; how many from there on are looked at one by one, or 0
+  int seeds[27];          // vertices to climb from, by directions (MuJoCo's mesh_extrema)
+};

@@ -18,7 +18,7 @@ DEV void add_external(State& s, int b, real sign, const real* force, const real*
 DEV void external_forces(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
   EACH(n, 6 * NB) s.cfrc_ext[n] = 0;
-  each_contact(t, s, [&](Contact& c) { push(M, c); });
+  if (!NOSLIP) each_contact(t, s, [&](Contact& c) { push(M, c); });
   t.sync();
   // All lanes go through all contacts, and each adds those of its bodies: in one order, so that
   // sums are the same for any number of lanes, and without atomic additions.

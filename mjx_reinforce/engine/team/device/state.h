@@ -87,6 +87,8 @@ struct alignas(4 * sizeof(real)) State : Drawn {
   Some<Quad[QUADS], NE> general;  // J of rows of no contact and no single dof
   Some<real, NE> general_residual, general_change, general_constraint_mass;
   Some<Cable, NCABLE> cables;
+  Some<Quad[QUADS], NOSLIP ? SIDE : 0> inverse;  // of M
+  Some<real, NOSLIP && LOSSES ? NV : 0> loss_force;
   union {
     Quad rows[SIDE][QUADS];  // below the diagonal M, above it what eliminates
     Quad subtree[NL][5];     // inertia [10], force [6]
