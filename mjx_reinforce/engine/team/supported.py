@@ -42,6 +42,16 @@ NUM_PARTS = {
     (PLANE, CYLINDER): 4,
     (BOX, BOX): 8,
 }
+#: The same of what MuJoCo's convex collider meets, which finds all contacts of a pair at once.
+CONVEX_CONTACTS = {
+    (SPHERE, ELLIPSOID): 1,
+    (CAPSULE, ELLIPSOID): 1,
+    (ELLIPSOID, ELLIPSOID): 1,
+    (ELLIPSOID, CYLINDER): 1,
+    (ELLIPSOID, BOX): 1,
+}
+#: Steps of the convex collider that a lane has room for: it numbers its triangles in a byte.
+_MAX_CONVEX_STEPS = 100
 
 
 class GeomPair(NamedTuple):
@@ -169,14 +179,20 @@ def _lacking_contacts(model: Any) -> Iterable[tuple[str, Any]]:
     """Yields what of contacts the device code lacks, and whether a model has it."""
     adhesions = (model.geom_adhesion, model.geom_surfacevel, model.pair_adhesion)
     yield "adhesion or moving surfaces", any(np.any(x) for x in adhesions)
-    num_items = 0
+    num_contacts = 0
+    has_convex = False
     for pair in meeting(model):
         kinds = geom_kinds(model, pair)
         flat_name, round_name = map(_geom_name, kinds)
-        yield f"{round_name} that meets {flat_name}", kinds not in NUM_PARTS
+        is_convex = kinds in CONVEX_CONTACTS
+        yield f"{round_name} that meets {flat_name}", not is_convex and kinds not in NUM_PARTS
         # A kind that is lacking does not get here: ``why`` stops at the first one.
-        num_items += NUM_PARTS[kinds]
-    yield f"more than {_MAX_ITEMS} possible contacts", num_items > _MAX_ITEMS
+        num_contacts += CONVEX_CONTACTS[kinds] if is_convex else NUM_PARTS[kinds]
+        has_convex |= is_convex
+    yield f"more than {_MAX_ITEMS} possible contacts", num_contacts > _MAX_ITEMS
+    is_long = model.opt.ccd_iterations > _MAX_CONVEX_STEPS
+    yield f"more than {_MAX_CONVEX_STEPS} ccd_iterations", has_convex and is_long
+    yield "the flag nativeccd disabled", has_convex and flags.is_off(model, "nativeccd")
 
 
 def _geom_name(kind: int) -> str:

@@ -62,6 +62,10 @@ _HEADERS = [
     "cylinders",
     "hulls",
     "two_boxes",
+    "support",
+    "gjk",
+    "epa",
+    "convex",
     "collision",
     "equality",
     "elimination",
@@ -113,7 +117,7 @@ def far_words(mj_model: MjModel, num_near: int = NUM_NEAR, random: Collection[st
     sizes = _Tables(mj_model, num_near, random).constants
     # The Contact of state.h.
     contact_words = 13 + 5 * sizes["CD"] + sizes["ELLIPTIC"] + 5 * sizes["DRAWS_FRICTION"]
-    words = max(0, int(sizes["NI"] - sizes["NEAR"])) * int(contact_words)
+    words = max(0, int(sizes["NC"] - sizes["NEAR"])) * int(contact_words)
     return words + words % 2  # numbers of 8 bytes may follow
 
 
@@ -722,6 +726,8 @@ class _Tables:
         has_friction = "geom_friction" in self.random
         kind_numbers: dict[tuple[ContactKind, int], int] = {}
         kind_pairs = 0
+        convex_kinds = 0
+        convex_contacts = []
         items = []
         item_kinds = []
         weights = []
@@ -737,7 +743,11 @@ class _Tables:
             geom_types = supported.geom_kinds(model, pair)
             flat, other = (_GEOM_KINDS[x] for x in geom_types)
             kind_pairs |= 1 << (other * (other + 1) // 2 + flat)
-            for part in range(supported.NUM_PARTS[geom_types]):
+            if geom_types in supported.CONVEX_CONTACTS:
+                convex_kinds |= 1 << flat | 1 << other
+                convex_contacts.append(supported.CONVEX_CONTACTS[geom_types])
+            # The convex collider finds all contacts of a pair at once.
+            for part in range(supported.NUM_PARTS.get(geom_types, 1)):
                 items.append(records.packed_item(geom_ids[pair.geom1], geom_ids[pair.geom2], part))
                 item_kinds.append(number)
                 weights.append(weight)
@@ -766,7 +776,14 @@ class _Tables:
             self.ints["kind_soft_friction"] = [self._number(x.friction_softness) for x in kinds]
         self.constants["KIND_PAIRS"] = kind_pairs
         self.constants["NI"] = len(items)
-        self.constants["NEAR"] = max(1, min(num_near, len(items)))
+        num_contacts = len(items) + sum(convex_contacts) - len(convex_contacts)
+        self.constants["NC"] = num_contacts
+        self.constants["NEAR"] = max(1, min(num_near, num_contacts))
+        self.constants["CONVEX_KINDS"] = convex_kinds
+        self.constants["CONVEX_CONTACTS"] = max(convex_contacts, default=0)
+        self.constants["CONVEX_STEPS"] = model.opt.ccd_iterations
+        self.real_constants["CONVEX_TOLERANCE"] = float(model.opt.ccd_tolerance)
+        self.reals["kind_gap"] = [x.gap for x in kinds] if convex_contacts else []
         self.constants["CD"] = max((x.dim for x in kinds), default=1)
         self.constants["NG"] = max(len(geoms), 1)
         self._geoms(self.geoms)

@@ -40,26 +40,6 @@ DEV Touch touch_of(const Model& M, const State& s, int item, real margin) {
   return c;
 }
 
-// The axes of a contact as mju_makeFrame has them.
-DEV void make_frame(real* frame, const Touch& c) {
-  real along[3] = {c.tangent[0], c.tangent[1], c.tangent[2]};
-  if (dot(along, along) < real(.25)) {
-    const bool y = fabs(c.normal[1]) < real(.5);
-    along[0] = 0; along[1] = y; along[2] = !y;
-  }
-  const real across = dot(c.normal, along);
-  for (int k = 0; k < 3; k++) along[k] -= across * c.normal[k];
-  const real square = dot(along, along);
-  const bool upright = square < real(1e-30);  // a capsule that stands on a plane
-  const real scale = inverse_root(upright ? real(1) : square);
-  if (upright) along[0] = 1;
-  for (int k = 0; k < 3; k++) {
-    frame[k] = c.normal[k];
-    frame[3 + k] = scale * along[k];
-  }
-  cross(frame + 6, frame, frame + 3);
-}
-
 // A contact, what its rows want included (mj_instantiateContact, mj_referenceConstraint).
 DEV Contact contact_of(const Model& M, const State& s, int item, const Touch& touch) {
   Contact c;
@@ -108,21 +88,28 @@ DEV void collide(const Team& t, const Model& M, State& s) {
       t.sync();
       const bool has_item = lane < waiting;
       const int queued_item = s.queue[lane];
-      bool touches = false;
-      Touch touch;
+      int touches = 0;
+      Touch touch[MOST_TOUCHES];
       if (has_item) {
         const real margin = M.kind_margin[M.item_kind[queued_item]];
-        touch = touch_of(M, s, queued_item, margin);
-        touches = touch.distance < margin;
+        const int a = M.item[queued_item].first(), b = M.item[queued_item].second();
+        if (CONVEX_CONTACTS && meet_as_convex(M, a, b)) {
+          touches = touch_convex(M, s, queued_item, margin, touch);
+        } else {
+          touch[0] = touch_of(M, s, queued_item, margin);
+          touches = touch[0].distance < margin;
+        }
       }
-      const unsigned touching_lanes = t.ballot(touches);
-      if (touches) {
-        const int at = num_contacts + count(touching_lanes & ((1u << lane) - 1));
-        const Contact contact = contact_of(M, s, queued_item, touch);
-        // Not by contact_at: stores through a reference to either would be to no known memory.
-        if (!FAR || at < NEAR) s.contacts[at] = contact; else s.far[at - NEAR] = contact;
+      LOOP for (int n = 0; n < MOST_TOUCHES; n++) {
+        const unsigned touching_lanes = t.ballot(n < touches);
+        if (n < touches) {
+          const int at = num_contacts + count(touching_lanes & ((1u << lane) - 1));
+          const Contact contact = contact_of(M, s, queued_item, touch[n]);
+          // Not by contact_at: stores through a reference to either would be to no known memory.
+          if (!FAR || at < NEAR) s.contacts[at] = contact; else s.far[at - NEAR] = contact;
+        }
+        num_contacts += count(touching_lanes);
       }
-      num_contacts += count(touching_lanes);
       const int next = s.queue[W + lane];
       t.sync();
       waiting -= W;

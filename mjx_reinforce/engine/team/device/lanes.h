@@ -2,6 +2,7 @@
 #pragma once
 #ifdef __CUDACC__
 #define DEV __device__ __forceinline__
+#define CALL static __device__ __noinline__
 #define UNROLL _Pragma("unroll")
 #define LOOP _Pragma("unroll 1")
 #define TABLE static __device__ const
@@ -11,6 +12,7 @@ typedef float real;
 #include <cstddef>
 #include <cstring>
 #define DEV inline
+#define CALL static inline
 #define UNROLL
 #define LOOP
 #define TABLE static const

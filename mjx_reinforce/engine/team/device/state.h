@@ -32,7 +32,7 @@ DEV constexpr int quads(int numbers) { return ((numbers + 3) / 4) | 1; }
 constexpr int QUADS = quads(SIDE + (ROWS_A_LANE == 1));
 constexpr int STRIDE = 4 * QUADS;
 // Contacts that the state has no room for.
-constexpr int FAR = NI > NEAR ? NI - NEAR : 0;
+constexpr int FAR = NC > NEAR ? NC - NEAR : 0;
 
 // What a task may read after a step; the program that plays it says what it reads.
 // SEEN_ is of its last forward pass.
