@@ -96,6 +96,14 @@ def _add(hulls: Hulls, model: Any, mesh: int, places: np.ndarray, graph: np.ndar
     hulls.hulls.append((first, len(places) if is_searched else 0, *seeds))
 
 
+def degree(hulls: Hulls) -> int:
+    """Returns the largest number of faces around a vertex."""
+    ends = [n for n, x in enumerate(hulls.faces) if x == _END]
+    return max(
+        (end - start for start, end in zip(hulls.vertex_faces, ends, strict=True)), default=0
+    )
+
+
 def text(hulls: Hulls) -> list[str]:
     """Returns the C++ of hulls; arrays that nothing reads where there are none."""
     vertices = [

@@ -49,6 +49,15 @@ CONVEX_CONTACTS = {
     (ELLIPSOID, ELLIPSOID): 1,
     (ELLIPSOID, CYLINDER): 1,
     (ELLIPSOID, BOX): 1,
+    (SPHERE, MESH): 1,
+    (ELLIPSOID, MESH): 1,
+    (CAPSULE, CYLINDER): 2,
+    (CAPSULE, MESH): 2,
+    (CYLINDER, CYLINDER): 4,
+    (CYLINDER, BOX): 4,
+    (CYLINDER, MESH): 4,
+    (BOX, MESH): 4,
+    (MESH, MESH): 4,
 }
 #: Steps of the convex collider that a lane has room for: it numbers its triangles in a byte.
 _MAX_CONVEX_STEPS = 100

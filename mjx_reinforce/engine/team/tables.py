@@ -65,6 +65,7 @@ _HEADERS = [
     "support",
     "gjk",
     "epa",
+    "faces",
     "convex",
     "collision",
     "equality",
@@ -781,6 +782,7 @@ class _Tables:
         self.constants["NEAR"] = max(1, min(num_near, num_contacts))
         self.constants["CONVEX_KINDS"] = convex_kinds
         self.constants["CONVEX_CONTACTS"] = max(convex_contacts, default=0)
+        self.constants["MORE_CONTACTS"] = not flags.is_off(model, "multiccd")
         self.constants["CONVEX_STEPS"] = model.opt.ccd_iterations
         self.real_constants["CONVEX_TOLERANCE"] = float(model.opt.ccd_tolerance)
         self.reals["kind_gap"] = [x.gap for x in kinds] if convex_contacts else []
@@ -818,6 +820,9 @@ class _Tables:
         meshes = model.geom_dataid[geoms]
         numbers = [self.hulls.numbers.get(int(x), -1) for x in meshes]
         self.ints["geom_hull"] = numbers if has_meshes else []
+        # Of a box, and of the polygon that a cylinder's end is.
+        self.constants["CONVEX_SIDES"] = max(16, *(x for _, x in self.hulls.face_corners), 0)
+        self.constants["CONVEX_DEGREE"] = max(3, hulls.degree(self.hulls))
 
     def _sensors(self) -> None:
         """Makes the tables of sensors of touch."""

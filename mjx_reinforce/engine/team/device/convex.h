@@ -12,8 +12,12 @@ DEV bool meet_as_convex(const Model& M, int a, int b) {
   return below != BOX || above == MESH;
 }
 
-// How two solids touch, if they do (mjc_ccd).
-DEV bool touch_solids(const Model& M, TwoSolids& two, Touch& c) {
+// How two solids touch (mjc_ccd); returns the number of contacts.
+DEV int touch_solids(const Model& M, TwoSolids& two, Touch* touch) {
+  Touch& c = touch[0];
+  const bool has_more = MORE_CONTACTS && may_have_more(M, two);
+  bool are_flat = true;
+  for (int side = 0; side < 2; side++) are_flat &= M.geom_kind[two.side[side].geom] >= BOX;
   const real around[2] = {two.side[0].swelling, two.side[1].swelling};
   const real reach = around[0] + around[1];
   Simplex s;
@@ -21,22 +25,25 @@ DEV bool touch_solids(const Model& M, TwoSolids& two, Touch& c) {
   LOOP for (bool is_swollen = reach == 0;; is_swollen = true) {
     for (int side = 0; side < 2; side++)
       two.side[side].swelling = is_swollen ? around[side] : real(0);
+    two.have_corners = are_flat && (!is_swollen || reach == 0);
     const real distance = approach(M, two, is_swollen ? real(0) : reach, s);
     if (distance > CONVEX_TOLERANCE) {
-      if (is_swollen || distance >= reach) return false;
+      if (is_swollen || distance >= reach) return 0;
       for (int k = 0; k < 3; k++) {
         c.normal[k] = -s.gap[k] / distance;
         c.at[k] = s.on_first[k] - s.gap[k] / 2 + (around[0] - around[1]) / 2 * c.normal[k];
       }
       c.distance = distance - reach;
-      return true;
+      for (int side = 0; side < 2; side++) two.side[side].swelling = around[side];
+      const Corner* corner[3] = {s.corner, s.corner + (s.size > 1), s.corner + (s.size > 2 ? 2 : 0)};
+      return has_more ? touch_more(M, two, corner, touch) : 1;
     }
     if (is_swollen) break;
   }
   Polytope p;
   Face face;
   if (s.size < 2 || s.is_apart || !make_polytope(M, two, s, p) || !grow(M, two, p, face))
-    return false;
+    return 0;
   const Corner &u = p.corner[face.corner[0]], &v = p.corner[face.corner[1]];
   const Corner& w = p.corner[face.corner[2]];
   real normal[3], part[3];
@@ -47,7 +54,8 @@ DEV bool touch_solids(const Model& M, TwoSolids& two, Touch& c) {
     c.at[k] = on_first - face.nearest[k] / 2;
   }
   c.distance = -depth;
-  return true;
+  const Corner* corner[3] = {&u, &v, &w};
+  return has_more ? touch_more(M, two, corner, touch) : 1;
 }
 
 // The contacts of an item's geoms; returns how many.
@@ -65,11 +73,16 @@ CALL int touch_convex(const Model& M, const State& s, int item, real margin, Tou
     solid.geom = geom;
     solid.vertex = -1;
   }
-  if (!touch_solids(M, two, touch[0])) return 0;
-  touch[0].distance += reach;
-  for (int k = 0; k < 3; k++) {
-    touch[0].at[k] += center.x[k];
-    touch[0].tangent[k] = 0;
+  const int contacts = touch_solids(M, two, touch);
+  int kept = 0;
+  LOOP for (int n = 0; n < contacts; n++) {
+    Touch c = touch[n];
+    c.distance += reach;
+    for (int k = 0; k < 3; k++) {
+      c.at[k] += center.x[k];
+      c.tangent[k] = 0;
+    }
+    if (c.distance < margin) touch[kept++] = c;
   }
-  return touch[0].distance < margin;
+  return kept;
 }

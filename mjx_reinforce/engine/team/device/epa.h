@@ -7,6 +7,8 @@ constexpr int MOST_FACES = 2 * MOST_CORNERS_OF_ONE;  // by Euler, four fewer
 // The origin is on a face, by the square of its distance (C's numbers for both precisions).
 constexpr real ON_FACE = real(SINGLE ? 1e-10 : 1e-30);
 constexpr real ON_TETRAHEDRON = real(SINGLE ? 1e-17 : 1e-30);
+// Between flat faces the search ends by itself; what is left is rounding.
+constexpr real SAME_DEPTH = real(SINGLE ? 1e-7 : 1e-15);
 constexpr real DEPTH_ROUNDING = real(SINGLE ? 1e-6 : 1e-10);
 
 // A triangle: its corners, the faces across its sides, and the point of its plane closest to the
@@ -226,6 +228,7 @@ DEV void remove_seen(Polytope& p, int first, const real* corner) {
 
 // Grows a polytope. Returns whether the solids overlap, and the face at their depth (epa).
 DEV bool grow(const Model& M, TwoSolids& two, Polytope& p, Face& deepest) {
+  const real enough = two.have_corners ? SAME_DEPTH : CONVEX_TOLERANCE;
   real upper = real(1e15);
   LOOP for (int step = 0; step < CONVEX_STEPS; step++) {
     real square = real(1e30);
@@ -243,7 +246,11 @@ DEV bool grow(const Model& M, TwoSolids& two, Polytope& p, Face& deepest) {
     const Corner& corner = p.corner[number];
     const real bound = dot(deepest.nearest, corner.at) / lower;
     if (bound < upper) upper = bound;
-    if (bound - lower < CONVEX_TOLERANCE) return step > 0 || bound >= lower - DEPTH_ROUNDING;
+    if (bound - lower < enough) return step > 0 || bound >= lower - DEPTH_ROUNDING;
+    if (two.have_corners)
+      LOOP for (int n = 0; n < number; n++)
+        if (p.corner[n].vertex[0] == corner.vertex[0] && p.corner[n].vertex[1] == corner.vertex[1])
+          return true;
     remove_seen(p, closest, corner.at);
     if (p.rims < 3) return false;
     if (p.rims > p.spares) return true;

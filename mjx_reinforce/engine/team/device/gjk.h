@@ -114,14 +114,16 @@ DEV void reduce(Simplex& s, real* weight) {
 // Returns the distance of two solids, and the simplex that shows it; where they are further apart
 // than `most`, only that.
 DEV real approach(const Model& M, TwoSolids& two, real most, Simplex& s) {
-  const real enough = CONVEX_TOLERANCE * CONVEX_TOLERANCE / 2;
+  // Between flat faces the search ends by itself.
+  const real enough = two.have_corners ? real(0) : CONVEX_TOLERANCE * CONVEX_TOLERANCE / 2;
+  const real touching = two.have_corners ? LEAST : CONVEX_TOLERANCE;
   for (int k = 0; k < 3; k++)
     s.gap[k] = two.side[0].pose.origin(k) - two.side[1].pose.origin(k);
   s.size = 0;
   s.is_apart = false;
   real length = root(dot(s.gap, s.gap)), before = 0, weight[4], direction[3];
   LOOP for (int steps = 0; steps < CONVEX_STEPS; steps++) {
-    if (length < CONVEX_TOLERANCE || fabs(before - length) < LEAST) break;
+    if (length < touching || fabs(before - length) < LEAST) break;
     Corner& c = s.corner[s.size];
     for (int k = 0; k < 3; k++) direction[k] = -s.gap[k] / length;
     find_corner(M, two, direction, c);

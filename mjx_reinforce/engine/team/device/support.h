@@ -12,7 +12,10 @@ struct Solid {
   real swelling;
   int geom, vertex;  // vertex: the last one of a mesh, or -1
 };
-struct TwoSolids { Solid side[2]; };
+struct TwoSolids {
+  Solid side[2];
+  bool have_corners;  // both surfaces are flat faces
+};
 // A point of the first solid less one of the second, and the former; the numbers of the vertices.
 struct Corner { real at[3], on[3]; int vertex[2]; };
 
@@ -20,12 +23,13 @@ struct Corner { real at[3], on[3]; int vertex[2]; };
 DEV constexpr bool is_convex(int kind) { return CONVEX_KINDS >> kind & 1; }
 
 // What is farthest in a direction of length 1, of a geom whose frame sees it as d (mjc_boxSupport,
-// mjc_cylinderSupport and others). Returns the number of a box's corner, by its signs.
-DEV int farthest(const Model& M, const Solid& solid, const real* d, real* p) {
+// mjc_cylinderSupport and others). Returns its number: of a box's corner, by its signs, of a
+// cylinder's end, or of a mesh's vertex.
+DEV int farthest(const Model& M, Solid& solid, const real* d, real* p) {
   const int kind = M.geom_kind[solid.geom];
   const real* size = M.geom_size + 3 * solid.geom;
   const real end = d[2] >= 0 ? M.geom_half[solid.geom] : -M.geom_half[solid.geom];
-  int corner = 0;
+  int corner = kind == CYLINDER && d[2] < 0;
   if (is_convex(BOX) && kind == BOX) {
     for (int k = 0; k < 3; k++) {
       p[k] = d[k] >= 0 ? size[k] : -size[k];
@@ -35,6 +39,9 @@ DEV int farthest(const Model& M, const Solid& solid, const real* d, real* p) {
     for (int k = 0; k < 3; k++) p[k] = d[k] * size[k];
     const real scale = inverse_root(dot(p, p));
     for (int k = 0; k < 3; k++) p[k] *= scale * size[k];
+  } else if (is_convex(MESH) && kind == MESH) {
+    corner = solid.vertex = farthest_vertex(hulls[M.geom_hull[solid.geom]], d, solid.vertex);
+    for (int k = 0; k < 3; k++) p[k] = hull_vertex[corner].at[k];
   } else {
     const real square = d[0] * d[0] + d[1] * d[1];
     const bool is_round = kind == ROUND || square < LEAST * LEAST;
