@@ -729,6 +729,10 @@ class _Tables:
         kind_pairs = 0
         convex_kinds = 0
         convex_contacts = []
+        num_contacts = 0
+        # Where parts are many, their table leaves little shared memory, and going through it takes
+        # long.
+        is_whole = supported.num_parts(model) > supported.MAX_ITEMS
         items = []
         item_kinds = []
         weights = []
@@ -748,7 +752,9 @@ class _Tables:
                 convex_kinds |= 1 << flat | 1 << other
                 convex_contacts.append(supported.CONVEX_CONTACTS[geom_types])
             # The convex collider finds all contacts of a pair at once.
-            for part in range(supported.NUM_PARTS.get(geom_types, 1)):
+            num_parts = supported.NUM_PARTS.get(geom_types, 1)
+            num_contacts += supported.CONVEX_CONTACTS.get(geom_types, num_parts)
+            for part in [num_parts - 1] if is_whole else range(num_parts):
                 items.append(records.packed_item(geom_ids[pair.geom1], geom_ids[pair.geom2], part))
                 item_kinds.append(number)
                 weights.append(weight)
@@ -777,7 +783,7 @@ class _Tables:
             self.ints["kind_soft_friction"] = [self._number(x.friction_softness) for x in kinds]
         self.constants["KIND_PAIRS"] = kind_pairs
         self.constants["NI"] = len(items)
-        num_contacts = len(items) + sum(convex_contacts) - len(convex_contacts)
+        self.constants["WHOLE_PAIRS"] = int(is_whole)
         self.constants["NC"] = num_contacts
         self.constants["NEAR"] = max(1, min(num_near, num_contacts))
         self.constants["CONVEX_KINDS"] = convex_kinds

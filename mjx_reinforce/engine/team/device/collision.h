@@ -2,9 +2,9 @@
 // them are looked at closely.
 #pragma once
 
-// The contact of an item, if its distance is below the margin.
-DEV Touch touch_of(const Model& M, const State& s, int item, real margin) {
-  const int a = M.item[item].first(), b = M.item[item].second(), part = M.item[item].part();
+// The contact of a part of an item, if its distance is below the margin.
+DEV Touch touch_of(const Model& M, const State& s, int item, int part, real margin) {
+  const int a = M.item[item].first(), b = M.item[item].second();
   Touch c;
   for (int k = 0; k < 3; k++) c.tangent[k] = 0;
   const int below = M.geom_kind[a], above = M.geom_kind[b];
@@ -88,28 +88,44 @@ DEV void collide(const Team& t, const Model& M, State& s) {
       t.sync();
       const bool has_item = lane < waiting;
       const int queued_item = s.queue[lane];
-      int touches = 0;
+      bool touches = false;
+      int contacts = 1;
       Touch touch[MOST_TOUCHES];
       if (has_item) {
+        const Item item = M.item[queued_item];
         const real margin = M.kind_margin[M.item_kind[queued_item]];
-        const int a = M.item[queued_item].first(), b = M.item[queued_item].second();
-        if (CONVEX_CONTACTS && meet_as_convex(M, a, b)) {
-          touches = touch_convex(M, s, queued_item, margin, touch);
+        if (CONVEX_CONTACTS && meet_as_convex(M, item)) {
+          contacts = touch_convex(M, s, queued_item, margin, touch);
+          touches = contacts > 0;
+        } else if (WHOLE_PAIRS) {
+          contacts = 0;
+          LOOP for (int part = 0; part <= item.part() && contacts < MOST_TOUCHES; part++) {
+            touch[contacts] = touch_of(M, s, queued_item, part, margin);
+            contacts += touch[contacts].distance < margin;
+          }
+          touches = contacts > 0;
         } else {
-          touch[0] = touch_of(M, s, queued_item, margin);
+          touch[0] = touch_of(M, s, queued_item, item.part(), margin);
           touches = touch[0].distance < margin;
         }
       }
+      // In the order of the items, whatever the number of lanes: no_slip goes through them in it.
+      int before = 0, all = 0;
+      UNROLL for (int n = 0; n < MOST_TOUCHES; n++) {
+        const unsigned touching_lanes = t.ballot(n > 0 ? touches && n < contacts : touches);
+        before += count(touching_lanes & ((1u << lane) - 1));
+        all += count(touching_lanes);
+      }
       LOOP for (int n = 0; n < MOST_TOUCHES; n++) {
-        const unsigned touching_lanes = t.ballot(n < touches);
-        if (n < touches) {
-          const int at = num_contacts + count(touching_lanes & ((1u << lane) - 1));
+        if (n > 0) touches &= n < contacts;
+        if (touches) {
+          const int at = num_contacts + before + n;
           const Contact contact = contact_of(M, s, queued_item, touch[n]);
           // Not by contact_at: stores through a reference to either would be to no known memory.
           if (!FAR || at < NEAR) s.contacts[at] = contact; else s.far[at - NEAR] = contact;
         }
-        num_contacts += count(touching_lanes);
       }
+      num_contacts += all;
       const int next = s.queue[W + lane];
       t.sync();
       waiting -= W;

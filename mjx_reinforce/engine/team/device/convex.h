@@ -1,11 +1,12 @@
 // Contacts of two convex geoms (mjc_Convex of MuJoCo 4.0).
 #pragma once
 
-constexpr int MOST_TOUCHES = CONVEX_CONTACTS > 1 ? CONVEX_CONTACTS : 1;
+// Of one item. A box and a box have at most 8, which C finds in as many parts.
+constexpr int MOST_TOUCHES = WHOLE_PAIRS ? 8 : CONVEX_CONTACTS > 1 ? CONVEX_CONTACTS : 1;
 
 // Whether two geoms meet as convex ones; of others, C has closed forms.
-DEV bool meet_as_convex(const Model& M, int a, int b) {
-  const int below = M.geom_kind[a], above = M.geom_kind[b];
+DEV bool meet_as_convex(const Model& M, Item item) {
+  const int a = item.first(), below = M.geom_kind[a], above = M.geom_kind[item.second()];
   if (!is_convex(below) || !is_convex(above)) return false;
   if (below == ROUND)
     return above == ELLIPSOID || above == MESH || (above == CYLINDER && M.geom_half[a] > 0);
