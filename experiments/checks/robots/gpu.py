@@ -85,9 +85,11 @@ def measure(output: Path, folder: Path, listed: Path, seconds: float, commit: st
     """
     deadline = time.monotonic() + seconds
     finished = {row["task"] for row in rows.read(output)} if output.exists() else set()
-    paths = [
-        folder.resolve() / row["package"] / row["model"] for row in covered(rows.read(listed))
-    ]
+    # What had all the time that there is and has no row is not tried again.
+    tried = output.with_suffix(".tried")
+    if tried.exists():
+        finished.update(tried.read_text("utf-8").splitlines())
+    paths = [folder.resolve() / row["package"] / row["model"] for row in covered(rows.read(listed))]
     tasks = [task for task in map(task_of, paths) if task not in finished]
     print(f"{len(tasks)} models of {len(paths)} are to be timed", flush=True)
     for first in range(0, len(tasks), _AT_ONCE):
@@ -96,17 +98,21 @@ def measure(output: Path, folder: Path, listed: Path, seconds: float, commit: st
             print(f"{left:.0f} s are left, too few for {tasks[first]}", flush=True)
             return
         print(f"{first} of {len(tasks)} are done, {left:.0f} s are left", flush=True)
+        batch = tasks[first : first + _AT_ONCE]
         settings = benchmark.Settings(
             part="gpu",
             minutes=min(left, _MOST_SECONDS) / 60,
             csv=output,
             commit=commit,
-            tasks=tuple(tasks[first : first + _AT_ONCE]),
+            tasks=tuple(batch),
             batches=NUMBERS,
             steps=_STEPS,
             repeats=_REPEATS,
         )
         benchmark.conduct(settings)
+        if left >= _MOST_SECONDS:
+            with tried.open("a", encoding="utf-8") as file:
+                file.writelines(f"{task}\n" for task in batch)
 
 
 def merged(
