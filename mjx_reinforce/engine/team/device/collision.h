@@ -88,21 +88,23 @@ DEV void collide(const Team& t, const Model& M, State& s) {
       t.sync();
       const bool has_item = lane < waiting;
       const int queued_item = s.queue[lane];
-      int touches = 0;
+      bool touches = false;
+      int contacts = 1;
       Touch touch[MOST_TOUCHES];
       if (has_item) {
         const real margin = M.kind_margin[M.item_kind[queued_item]];
-        const int a = M.item[queued_item].first(), b = M.item[queued_item].second();
-        if (CONVEX_CONTACTS && meet_as_convex(M, a, b)) {
-          touches = touch_convex(M, s, queued_item, margin, touch);
+        if (CONVEX_CONTACTS && meet_as_convex(M, M.item[queued_item])) {
+          contacts = touch_convex(M, s, queued_item, margin, touch);
+          touches = contacts > 0;
         } else {
           touch[0] = touch_of(M, s, queued_item, margin);
           touches = touch[0].distance < margin;
         }
       }
       LOOP for (int n = 0; n < MOST_TOUCHES; n++) {
-        const unsigned touching_lanes = t.ballot(n < touches);
-        if (n < touches) {
+        if (n > 0) touches &= n < contacts;
+        const unsigned touching_lanes = t.ballot(touches);
+        if (touches) {
           const int at = num_contacts + count(touching_lanes & ((1u << lane) - 1));
           const Contact contact = contact_of(M, s, queued_item, touch[n]);
           // Not by contact_at: stores through a reference to either would be to no known memory.

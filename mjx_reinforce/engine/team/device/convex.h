@@ -4,8 +4,8 @@
 constexpr int MOST_TOUCHES = CONVEX_CONTACTS > 1 ? CONVEX_CONTACTS : 1;
 
 // Whether two geoms meet as convex ones; of others, C has closed forms.
-DEV bool meet_as_convex(const Model& M, int a, int b) {
-  const int below = M.geom_kind[a], above = M.geom_kind[b];
+DEV bool meet_as_convex(const Model& M, Item item) {
+  const int a = item.first(), below = M.geom_kind[a], above = M.geom_kind[item.second()];
   if (!is_convex(below) || !is_convex(above)) return false;
   if (below == ROUND)
     return above == ELLIPSOID || above == MESH || (above == CYLINDER && M.geom_half[a] > 0);
