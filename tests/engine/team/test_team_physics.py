@@ -302,8 +302,8 @@ def test_actuators_of_several_controls_are_named():
 
 
 def test_a_model_that_is_not_covered_has_no_device_code():
-    m = _model(**_REFUSED["a sphere that meets a hfield"])
-    with pytest.raises(UnsupportedPrimitive, match="a sphere that meets a hfield"):
+    m = _model(**_REFUSED["a capsule that meets a hfield"])
+    with pytest.raises(UnsupportedPrimitive, match="a capsule that meets a hfield"):
         tables.physics_text(m)
 
 

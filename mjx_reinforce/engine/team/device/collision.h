@@ -92,40 +92,39 @@ DEV void collide(const Team& t, const Model& M, State& s) {
       int contacts = 1;
       Touch touch[MOST_TOUCHES];
       if (has_item) {
-        const Item item = M.item[queued_item];
         const real margin = M.kind_margin[M.item_kind[queued_item]];
-        if (CONVEX_CONTACTS && meet_as_convex(M, item)) {
+        if (CONVEX_CONTACTS && meet_as_convex(M, M.item[queued_item])) {
           contacts = touch_convex(M, s, queued_item, margin, touch);
           touches = contacts > 0;
         } else if (WHOLE_PAIRS) {
           contacts = 0;
-          LOOP for (int part = 0; part <= item.part() && contacts < MOST_TOUCHES; part++) {
+          const int last_part = M.item[queued_item].part();
+          LOOP for (int part = 0; part <= last_part && contacts < MOST_TOUCHES; part++) {
             touch[contacts] = touch_of(M, s, queued_item, part, margin);
             contacts += touch[contacts].distance < margin;
           }
           touches = contacts > 0;
         } else {
-          touch[0] = touch_of(M, s, queued_item, item.part(), margin);
+          touch[0] = touch_of(M, s, queued_item, M.item[queued_item].part(), margin);
           touches = touch[0].distance < margin;
         }
       }
       // In the order of the items, whatever the number of lanes: no_slip goes through them in it.
-      int before = 0, all = 0;
-      UNROLL for (int n = 0; n < MOST_TOUCHES; n++) {
-        const unsigned touching_lanes = t.ballot(n > 0 ? touches && n < contacts : touches);
-        before += count(touching_lanes & ((1u << lane) - 1));
-        all += count(touching_lanes);
-      }
+      unsigned touching_lanes[MOST_TOUCHES];
+      UNROLL for (int n = 0; n < MOST_TOUCHES; n++)
+        touching_lanes[n] = t.ballot(n > 0 ? touches && n < contacts : touches);
       LOOP for (int n = 0; n < MOST_TOUCHES; n++) {
         if (n > 0) touches &= n < contacts;
         if (touches) {
-          const int at = num_contacts + before + n;
+          int at = num_contacts + n;
+          UNROLL for (int k = 0; k < MOST_TOUCHES; k++)
+            at += count(touching_lanes[k] & ((1u << lane) - 1));
           const Contact contact = contact_of(M, s, queued_item, touch[n]);
           // Not by contact_at: stores through a reference to either would be to no known memory.
           if (!FAR || at < NEAR) s.contacts[at] = contact; else s.far[at - NEAR] = contact;
         }
       }
-      num_contacts += all;
+      UNROLL for (int n = 0; n < MOST_TOUCHES; n++) num_contacts += count(touching_lanes[n]);
       const int next = s.queue[W + lane];
       t.sync();
       waiting -= W;

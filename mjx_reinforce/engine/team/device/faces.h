@@ -4,6 +4,8 @@
 
 // Faces are parallel, and an edge is along a face, within this cosine and sine.
 constexpr real FACE_COSINE = real(.996), EDGE_SINE = real(.0888);
+// What is rounding of an area, by the area: of a cylinder's end many are the largest.
+constexpr real SAME_AREA = real(SINGLE ? 1e-5 : 1e-12);
 constexpr int ROUND_SIDES = 16;  // of the polygon that is a cylinder's end
 
 // What the deepest triangle has of one of the solids: its vertices, of which `count` differ, and
@@ -195,7 +197,7 @@ DEV void widen(const real (*polygon)[3], int corners, int* n) {
     const int before = at[i];
     at[i] = next(before);
     const real x = area(at);
-    if (x <= most) {
+    if (x <= most * (1 + SAME_AREA)) {
       at[i] = before;
       return false;
     }
