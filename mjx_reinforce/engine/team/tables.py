@@ -770,17 +770,7 @@ class _Tables:
         self.ints["kind_mix"] = [mix for _, mix in kind_numbers] if has_friction else []
         self.geoms = np.array(geoms, int)
         kinds = [kind for kind, _ in kind_numbers]
-        self.ints["kind_dim"] = [x.dim for x in kinds]
-        self.ints["kind_soft"] = [self._number(x.softness) for x in kinds]
-        self.reals["kind_margin"] = [x.margin for x in kinds]
-        self.reals["kind_friction"] = [x.friction for x in kinds]
-        self.reals["kind_mu"] = []
-        self.ints["kind_soft_friction"] = []
-        if self._is_elliptic():
-            # C's regularized friction of the cone.
-            root = np.sqrt(max(model.opt.impratio, MIN_VALUE))
-            self.reals["kind_mu"] = [x.friction[0] / root for x in kinds]
-            self.ints["kind_soft_friction"] = [self._number(x.friction_softness) for x in kinds]
+        self._kinds(kinds)
         self.constants["KIND_PAIRS"] = kind_pairs
         self.constants["NI"] = len(items)
         self.constants["WHOLE_PAIRS"] = int(is_whole)
@@ -795,6 +785,20 @@ class _Tables:
         self.constants["CD"] = max((x.dim for x in kinds), default=1)
         self.constants["NG"] = max(len(geoms), 1)
         self._geoms(self.geoms)
+
+    def _kinds(self, kinds: list[ContactKind]) -> None:
+        """Makes the tables of what contacts of several pairs have in common."""
+        self.ints["kind_dim"] = [x.dim for x in kinds]
+        self.ints["kind_soft"] = [self._number(x.softness) for x in kinds]
+        self.reals["kind_margin"] = [x.margin for x in kinds]
+        self.reals["kind_friction"] = [x.friction for x in kinds]
+        self.reals["kind_mu"] = []
+        self.ints["kind_soft_friction"] = []
+        if self._is_elliptic():
+            # C's regularized friction of the cone.
+            root = np.sqrt(max(self.model.opt.impratio, MIN_VALUE))
+            self.reals["kind_mu"] = [x.friction[0] / root for x in kinds]
+            self.ints["kind_soft_friction"] = [self._number(x.friction_softness) for x in kinds]
 
     def _geoms(self, geoms: np.ndarray) -> None:
         """Makes the tables of the geoms that may meet."""
