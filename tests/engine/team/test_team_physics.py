@@ -245,6 +245,14 @@ def test_pairs_whose_parts_are_many_are_whole(feature, lanes, tmp_path, monkeypa
 
 @needs_compiler
 @pytest.mark.slow
+@pytest.mark.parametrize("near", [3, tables.NUM_NEAR])
+def test_lanes_find_all_contacts_of_convex_pairs(near, tmp_path):
+    m = _model(**_MODELS["features"]["what is convex on a mesh, elliptic cones"])
+    assert _largest_error(_exact(m), tmp_path, skip=3, starts=1, near=near, lanes=8) < 1e-9
+
+
+@needs_compiler
+@pytest.mark.slow
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
 def test_a_quadruped_that_takes_few_steps(cone, tmp_path):
     spec = _C.MjSpec.from_file(f"{_OWN}.xml")
