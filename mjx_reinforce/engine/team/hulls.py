@@ -33,7 +33,7 @@ class Hulls(NamedTuple):
     vertex_faces: list[int]
     neighbors: list[int]
     faces: list[int]
-    face_normals: list[Sequence[float]]
+    face_normals: list[np.ndarray]
     face_corners: list[tuple[int, int]]
     corners: list[int]
     hulls: list[Sequence[int]]
@@ -117,7 +117,7 @@ def text(hulls: Hulls) -> list[str]:
         )
     ]
     faces = [
-        f"{{{{{','.join(f'real({float(x)!r})' for x in normal)}}},{start},{count}}}"
+        f"{{{{{','.join(map(repr, normal.tolist()))}}},{start},{count}}}"
         for normal, (start, count) in zip(hulls.face_normals, hulls.face_corners, strict=True)
     ]
     rows = [
