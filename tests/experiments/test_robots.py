@@ -98,7 +98,7 @@ def test_speeds_of_a_gpu_are_beside_what_teams_cover(tmp_path, monkeypatch):
         row |= {"package": "mujoco_menagerie", "model": f"{name}/scene.xml"}
         row |= {"verdict": "accepted", "error20": "1e-12"}
         if name == "refused":
-            row |= {"verdict": "refused", "cause": "it has a plugin", "error20": ""}
+            row |= {"verdict": "refused", "cause": "the model has a plugin", "error20": ""}
         team_rows.append(row)
     rows.write(tmp_path / "teams.csv", team_rows)
     called = []
@@ -124,10 +124,10 @@ def test_speeds_of_a_gpu_are_beside_what_teams_cover(tmp_path, monkeypatch):
     gpu.write(tmp_path / "page.csv", tmp_path / "teams.csv", timed, tmp_path)
     table = gpu.robots(rows.read(tmp_path / "page.csv")).splitlines()
     assert (
-        "| slow/scene.xml | 1 | 1e-12 | 600,000 | 100,000 | 600,000 | 100,000 | 6.0 | 6.0 |"
+        "| slow/scene.xml | 1 | 1e-12 |  | 600,000 | 100,000 | 600,000 | 100,000 | 6.0 | 6.0 |"
         in table
     )
-    assert "| refused/scene.xml | 1 | it has a plugin |  |  |  |  |  |  |" in table
+    assert "| refused/scene.xml | 1 | a plugin |  |  |  |  |  |  |  |" in table
     assert "| Menagerie's robots | 3 | 2 | 2 | 6.0 |" in gpu.summary(
         rows.read(tmp_path / "page.csv")
     )
