@@ -25,7 +25,8 @@ MAX_DOFS = 64
 #: Bits of a geom's number in a packed item, two of which and a part's number fit into an int.
 GEOM_BITS = 12
 _MAX_GEOMS = 2**GEOM_BITS
-_MAX_ITEMS = 4096
+#: What a team has memory for.
+_MAX_CONTACTS = 16384
 #: How many contacts two geoms of these types may have, each of which is a part of the pair.
 NUM_PARTS = {
     (PLANE, SPHERE): 1,
@@ -198,7 +199,7 @@ def _lacking_contacts(model: Any) -> Iterable[tuple[str, Any]]:
         # A kind that is lacking does not get here: ``why`` stops at the first one.
         num_contacts += CONVEX_CONTACTS[kinds] if is_convex else NUM_PARTS[kinds]
         has_convex |= is_convex
-    yield f"more than {_MAX_ITEMS} possible contacts", num_contacts > _MAX_ITEMS
+    yield f"more than {_MAX_CONTACTS} possible contacts", num_contacts > _MAX_CONTACTS
     is_long = model.opt.ccd_iterations > _MAX_CONVEX_STEPS
     yield f"more than {_MAX_CONVEX_STEPS} ccd_iterations", has_convex and is_long
     yield "the flag nativeccd disabled", has_convex and flags.is_off(model, "nativeccd")

@@ -49,7 +49,9 @@ _PAIRS = [
 _REFUSED = {
     **_MODELS["refused"],
     "4096 geoms or more": {"rest": f"<worldbody>{_MANY * 4096}</worldbody>"},
-    "more than 4096 possible contacts": {"bodies": [f'size=".1"/>{_MANY * 64}<geom size=".1"'] * 2},
+    "more than 16384 possible contacts": {
+        "bodies": [f'size=".1"/>{_MANY * 128}<geom size=".1"'] * 2
+    },
 }
 
 
