@@ -762,7 +762,7 @@ class _Tables:
         self._geoms(self.geoms)
 
     def _convex(self, pairs: Iterable[supported.GeomPair], kinds: Iterable[ContactKind]) -> int:
-        """Makes the tables of the convex collider; returns how many contacts it may find beyond one."""
+        """Makes the tables of the convex collider; returns how many contacts exceed one a pair."""
         model = self.model
         all_types = [supported.geom_kinds(model, x) for x in pairs]
         convex_types = [x for x in all_types if x in supported.CONVEX_CONTACTS]
