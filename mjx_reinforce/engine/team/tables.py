@@ -727,8 +727,6 @@ class _Tables:
         has_friction = "geom_friction" in self.random
         kind_numbers: dict[tuple[ContactKind, int], int] = {}
         kind_pairs = 0
-        convex_kinds = 0
-        convex_contacts = []
         num_contacts = 0
         # Where parts are many, their table leaves little shared memory, and going through it takes
         # long.
@@ -748,9 +746,6 @@ class _Tables:
             geom_types = supported.geom_kinds(model, pair)
             flat, other = (_GEOM_KINDS[x] for x in geom_types)
             kind_pairs |= 1 << (other * (other + 1) // 2 + flat)
-            if geom_types in supported.CONVEX_CONTACTS:
-                convex_kinds |= 1 << flat | 1 << other
-                convex_contacts.append(supported.CONVEX_CONTACTS[geom_types])
             # The convex collider finds all contacts of a pair at once.
             num_parts = supported.NUM_PARTS.get(geom_types, 1)
             num_contacts += supported.CONVEX_CONTACTS.get(geom_types, num_parts)
@@ -776,12 +771,7 @@ class _Tables:
         self.constants["WHOLE_PAIRS"] = int(is_whole)
         self.constants["NC"] = num_contacts
         self.constants["NEAR"] = max(1, min(num_near, num_contacts))
-        self.constants["CONVEX_KINDS"] = convex_kinds
-        self.constants["CONVEX_CONTACTS"] = max(convex_contacts, default=0)
-        self.constants["MORE_CONTACTS"] = not flags.is_off(model, "multiccd")
-        self.constants["CONVEX_STEPS"] = model.opt.ccd_iterations
-        self.real_constants["CONVEX_TOLERANCE"] = float(model.opt.ccd_tolerance)
-        self.reals["kind_gap"] = [x.gap for x in kinds] if convex_contacts else []
+        self._convex([pair for pair, _ in pairs], kinds)
         self.constants["CD"] = max((x.dim for x in kinds), default=1)
         self.constants["NG"] = max(len(geoms), 1)
         self._geoms(self.geoms)
@@ -799,6 +789,20 @@ class _Tables:
             root = np.sqrt(max(self.model.opt.impratio, MIN_VALUE))
             self.reals["kind_mu"] = [x.friction[0] / root for x in kinds]
             self.ints["kind_soft_friction"] = [self._number(x.friction_softness) for x in kinds]
+
+    def _convex(self, pairs: Iterable[supported.GeomPair], kinds: Iterable[ContactKind]) -> None:
+        """Makes the tables of the convex collider."""
+        model = self.model
+        all_types = [supported.geom_kinds(model, x) for x in pairs]
+        convex_types = [x for x in all_types if x in supported.CONVEX_CONTACTS]
+        num_contacts = [supported.CONVEX_CONTACTS[x] for x in convex_types]
+        geom_kinds = {_GEOM_KINDS[x] for types in convex_types for x in types}
+        self.constants["CONVEX_KINDS"] = sum(1 << x for x in geom_kinds)
+        self.constants["CONVEX_CONTACTS"] = max(num_contacts, default=0)
+        self.constants["MORE_CONTACTS"] = not flags.is_off(model, "multiccd")
+        self.constants["CONVEX_STEPS"] = model.opt.ccd_iterations
+        self.real_constants["CONVEX_TOLERANCE"] = float(model.opt.ccd_tolerance)
+        self.reals["kind_gap"] = [x.gap for x in kinds] if convex_types else []
 
     def _geoms(self, geoms: np.ndarray) -> None:
         """Makes the tables of the geoms that may meet."""

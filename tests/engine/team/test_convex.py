@@ -72,7 +72,7 @@ def _library(model: Any, folder: Path, real: str) -> Any:
     options = ["-O1", "-std=c++17", "-w", "-shared", "-fPIC", f"-DREAL={real}"]
     command = [str(device_code.COMPILER), *options, str(source), "-o", str(library)]
     subprocess.run(command, check=True)
-    return ctypes.CDLL(library)
+    return ctypes.CDLL(str(library))
 
 
 def _by_us(library: Any, qpos: np.ndarray) -> np.ndarray:
@@ -101,7 +101,7 @@ def _poses(model: Any) -> Iterator[np.ndarray]:
         direction /= np.linalg.norm(direction)
         quat = rng.normal(size=4)
         if count % 2:  # faces are nearly parallel
-            turn = Rotation.from_rotvec(0.02 * rng.normal(size=3)) * rights[rng.integers(24)]
+            turn = Rotation.from_rotvec(0.02 * rng.normal(size=3)) * rights[int(rng.integers(24))]
             quat = np.roll(turn.as_quat(), 1)
         low, high = 0.0, 1.0
         for _ in range(30):

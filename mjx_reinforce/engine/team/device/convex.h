@@ -36,7 +36,8 @@ DEV int touch_solids(const Model& M, TwoSolids& two, Touch* touch) {
       }
       c.distance = distance - reach;
       for (int side = 0; side < 2; side++) two.side[side].swelling = around[side];
-      const Corner* corner[3] = {s.corner, s.corner + (s.size > 1), s.corner + (s.size > 2 ? 2 : 0)};
+      const Corner *first = s.corner, *second = first + (s.size > 1);
+      const Corner* corner[3] = {first, second, s.size > 2 ? first + 2 : first};
       return has_more ? touch_more(M, two, corner, touch) : 1;
     }
     if (is_swollen) break;

@@ -1,4 +1,4 @@
-// How deep two convex solids are in one another (MuJoCo's engine_collision_gjk.c): a polytope within
+// How deep two convex solids are in one another (MuJoCo's engine_collision_gjk.c): a polytope in
 // their difference grows, by a corner a step, where its surface is closest to the origin.
 #pragma once
 

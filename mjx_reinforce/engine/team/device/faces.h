@@ -35,7 +35,8 @@ DEV Feature feature_of(const Corner* const* corner, int side) {
 
 // A vertex of a box or a mesh.
 DEV void place_vertex(const Model& M, const Solid& solid, int vertex, real* at) {
-  if (is_convex(MESH) && M.geom_kind[solid.geom] == MESH) return mesh_vertex(at, solid.pose, vertex);
+  const bool is_mesh = is_convex(MESH) && M.geom_kind[solid.geom] == MESH;
+  if (is_mesh) return mesh_vertex(at, solid.pose, vertex);
   real p[3];
   for (int k = 0; k < 3; k++) {
     const real half = M.geom_size[3 * solid.geom + k];
@@ -139,9 +140,9 @@ DEV int face_polygon(const Model& M, const Solid& solid, int face, real (*polygo
       const real p[3] = {radius * cosine, radius * (face ? sine : -sine), face ? -half : half};
       solid.pose.place(polygon[n], p);
     } else {
-      place_vertex(M, solid,
-                   kind == BOX ? box[face][n] : hull_corner[hull_face[face].corners + sides - 1 - n],
-                   polygon[n]);
+      const int last = sides - 1 - n;
+      const int vertex = kind == BOX ? box[face][n] : hull_corner[hull_face[face].corners + last];
+      place_vertex(M, solid, vertex, polygon[n]);
     }
   }
   return sides;
@@ -225,8 +226,9 @@ DEV int touch_more(const Model& M, const TwoSolids& two, const Corner* const* co
     feature[side] = feature_of(corner, side);
     const Solid& solid = two.side[side];
     const real sign = side ? real(-1) : real(1);
-    if (M.geom_kind[solid.geom] == ROUND)
-      for (int k = 0; k < 3; k++) feature[side].at[k] = c.at[k] - sign * c.distance / 2 * c.normal[k];
+    const bool is_round = M.geom_kind[solid.geom] == ROUND;
+    for (int k = 0; k < 3 && is_round; k++)
+      feature[side].at[k] = c.at[k] - sign * c.distance / 2 * c.normal[k];
     counts[side] = list_faces(M, solid, feature[side], sign, c.normal, faces[side]);
   }
   real least = -FACE_COSINE, start[3], end[3];

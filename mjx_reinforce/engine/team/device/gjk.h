@@ -1,6 +1,6 @@
 // How far two convex solids are apart (MuJoCo's engine_collision_gjk.c): the simplex of their
-// difference that is closest to the origin, after Montanari, Petrinic and Barbieri, ACM Transactions
-// on Graphics 36, 2017.
+// difference that is closest to the origin, after Montanari, Petrinic and Barbieri (ACM
+// Transactions on Graphics 36, 2017).
 #pragma once
 
 // What is rounding of a gap's square, by the square.
