@@ -124,7 +124,7 @@ def wrap_points(
     geoms = data.geom_xpos[geom], data.geom_xmat[geom], model.geom_size[geom, 0]
     arguments = *end_points, *geoms, data.site_xpos[side], side[:, None] >= 0, is_sphere
     search = impl.wrap_inside_maxiter, impl.wrap_inside_tolerance
-    # ``support.wrap`` asks in Python whether a tendon wraps inside, so that both kinds are computed
+    # MJX asks in Python whether a tendon wraps inside (support.py), so that both kinds are computed
     # apart, and then put back in their order.
     order = []
     paths = []

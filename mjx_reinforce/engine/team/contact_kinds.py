@@ -6,7 +6,7 @@ import numpy as np
 
 from mjx_reinforce.engine.team import flags
 from mjx_reinforce.engine.team.records import Softness
-from mjx_reinforce.engine.team.supported import GeomPair
+from mjx_reinforce.engine.team.supported import CONVEX_CONTACTS, GeomPair, geom_kinds
 
 #: MuJoCo's mjMINVAL, mjMINMU, mjMINIMP and mjMAXIMP.
 MIN_VALUE = 1e-15
@@ -20,6 +20,7 @@ class ContactKind(NamedTuple):
 
     dim: MuJoCo's condim
     margin: (m)
+    gap: beyond the margin, by which the convex collider lets geoms grow; 0 for others (m)
     friction: along the two tangents, about the normal, about the two tangents
     softness: of the rows
     friction_softness: that of the rows of friction of an elliptic cone
@@ -27,6 +28,7 @@ class ContactKind(NamedTuple):
 
     dim: int
     margin: float
+    gap: float
     friction: tuple[float, ...]
     softness: Softness
     friction_softness: Softness
@@ -61,6 +63,7 @@ def softness_of(model: Any, solref: np.ndarray, solimp: np.ndarray) -> Softness:
 
 def contact_kind(model: Any, pair: GeomPair) -> ContactKind:
     """Returns what contacts of a pair of geoms have."""
+    is_convex = geom_kinds(model, pair) in CONVEX_CONTACTS
     if pair.pair >= 0:
         ref = model.pair_solref[pair.pair]
         friction_ref = model.pair_solreffriction[pair.pair]
@@ -68,6 +71,7 @@ def contact_kind(model: Any, pair: GeomPair) -> ContactKind:
         return ContactKind(
             dim=int(model.pair_dim[pair.pair]),
             margin=float(model.pair_margin[pair.pair]),
+            gap=float(model.pair_gap[pair.pair]) if is_convex else 0.0,
             friction=_friction(model.pair_friction[pair.pair]),
             softness=softness_of(model, ref, imp),
             friction_softness=softness_of(model, friction_ref if friction_ref.any() else ref, imp),
@@ -96,6 +100,7 @@ def contact_kind(model: Any, pair: GeomPair) -> ContactKind:
     return ContactKind(
         dim=int(dim),
         margin=float(model.geom_margin[geoms].sum()),
+        gap=float(model.geom_gap[geoms].sum()) if is_convex else 0.0,
         friction=_friction(friction[[0, 0, 1, 2, 2]]),
         softness=softness,
         friction_softness=softness,

@@ -16,16 +16,18 @@ _C: Any = mujoco  # a C extension without stubs
 #: MuJoCo's mjtJoint.
 FREE, BALL, SLIDE, HINGE = range(4)
 #: MuJoCo's mjtGeom.
-PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = (
+PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = (
     int(getattr(_C.mjtGeom, f"mjGEOM_{name}"))
-    for name in ("PLANE", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX")
+    for name in ("PLANE", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH")
 )
 #: Bits of a mask of degrees of freedom, of which the widest is an unsigned long long.
 MAX_DOFS = 64
 #: Bits of a geom's number in a packed item, two of which and a part's number fit into an int.
 GEOM_BITS = 12
 _MAX_GEOMS = 2**GEOM_BITS
-_MAX_ITEMS = 4096
+MAX_ITEMS = 4096
+#: Contacts that a team has memory for, of some 250 bytes each.
+_MAX_CONTACTS = 4 * MAX_ITEMS
 #: How many contacts two geoms of these types may have, each of which is a part of the pair.
 NUM_PARTS = {
     (PLANE, SPHERE): 1,
@@ -37,10 +39,30 @@ NUM_PARTS = {
     (CAPSULE, CAPSULE): 1,
     (PLANE, CAPSULE): 2,
     (CAPSULE, BOX): 2,
+    (PLANE, MESH): 4,
     (PLANE, BOX): 4,
     (PLANE, CYLINDER): 4,
     (BOX, BOX): 8,
 }
+#: The same of what MuJoCo's convex collider meets, which finds all contacts of a pair at once.
+CONVEX_CONTACTS = {
+    (SPHERE, ELLIPSOID): 1,
+    (CAPSULE, ELLIPSOID): 1,
+    (ELLIPSOID, ELLIPSOID): 1,
+    (ELLIPSOID, CYLINDER): 1,
+    (ELLIPSOID, BOX): 1,
+    (SPHERE, MESH): 1,
+    (ELLIPSOID, MESH): 1,
+    (CAPSULE, CYLINDER): 2,
+    (CAPSULE, MESH): 2,
+    (CYLINDER, CYLINDER): 4,
+    (CYLINDER, BOX): 4,
+    (CYLINDER, MESH): 4,
+    (BOX, MESH): 4,
+    (MESH, MESH): 4,
+}
+#: Steps of the convex collider that a lane has room for: it numbers its triangles in a byte.
+_MAX_CONVEX_STEPS = 100
 
 
 class GeomPair(NamedTuple):
@@ -84,15 +106,15 @@ def _lacking_options(model: Any) -> Iterable[tuple[str, Any]]:
     integrators = (types.mjINT_EULER, types.mjINT_RK4, types.mjINT_IMPLICITFAST)
     yield "an integrator other than Euler, RK4 and implicitfast", opt.integrator not in integrators
     yield "a solver other than Newton", opt.solver != _C.mjtSolver.mjSOL_NEWTON
-    # Where C stops early it does so in each island, and in each stage.
+    # Where C stops early it does so in each stage.
     is_early = stops_early(model)
-    num_trees = len(set(np.asarray(model.dof_treeid)))
-    has_islands = num_trees > 1 and not flags.is_off(model, "island")
     limits = f"few iterations of its solver ({opt.iterations}, {opt.ls_iterations} along a line)"
-    yield f"{limits} for {num_trees} kinematic trees", is_early and has_islands
     yield f"{limits} under Runge-Kutta", is_early and opt.integrator == types.mjINT_RK4
     yield "flags that enable parts of the physics", flags.enabled_physics(model)
-    yield "noslip iterations", opt.noslip_iterations
+    has_noslip = opt.noslip_iterations > 0
+    yield f"{limits} and noslip iterations", is_early and has_noslip
+    pulls = model.ntendon and np.any(model.tendon_frictionloss)
+    yield "noslip iterations and friction loss of tendons", has_noslip and pulls
     has_medium = opt.density > 0 or opt.viscosity > 0
     is_fast = opt.integrator == types.mjINT_IMPLICITFAST
     yield "a medium under implicitfast", has_medium and is_fast
@@ -117,8 +139,8 @@ def _lacking_parts(model: Any) -> Iterable[tuple[str, Any]]:
     yield "tendons with a range of actuators' forces", np.any(model.tendon_actfrclimited)
     yield "joints that yield", np.any(model.jnt_springyield)
     active = model.eq_type[np.asarray(model.eq_active0, bool)]
-    equalities = (_C.mjtEq.mjEQ_CONNECT, _C.mjtEq.mjEQ_JOINT)
-    yield "equalities other than connect and joint", not np.isin(active, equalities).all()
+    equalities = (_C.mjtEq.mjEQ_CONNECT, _C.mjtEq.mjEQ_WELD, _C.mjtEq.mjEQ_JOINT)
+    yield "equalities other than connect, weld and joint", not np.isin(active, equalities).all()
 
 
 def _lacking_actuators(model: Any) -> Iterable[tuple[str, Any]]:
@@ -168,14 +190,27 @@ def _lacking_contacts(model: Any) -> Iterable[tuple[str, Any]]:
     """Yields what of contacts the device code lacks, and whether a model has it."""
     adhesions = (model.geom_adhesion, model.geom_surfacevel, model.pair_adhesion)
     yield "adhesion or moving surfaces", any(np.any(x) for x in adhesions)
-    num_items = 0
-    for pair in meeting(model):
+    num_contacts = 0
+    has_convex = False
+    pairs = meeting(model)
+    for pair in pairs:
         kinds = geom_kinds(model, pair)
         flat_name, round_name = map(_geom_name, kinds)
-        yield f"{round_name} that meets {flat_name}", kinds not in NUM_PARTS
+        is_convex = kinds in CONVEX_CONTACTS
+        yield f"{round_name} that meets {flat_name}", not is_convex and kinds not in NUM_PARTS
         # A kind that is lacking does not get here: ``why`` stops at the first one.
-        num_items += NUM_PARTS[kinds]
-    yield f"more than {_MAX_ITEMS} possible contacts", num_items > _MAX_ITEMS
+        num_contacts += CONVEX_CONTACTS[kinds] if is_convex else NUM_PARTS[kinds]
+        has_convex |= is_convex
+    yield f"more than {MAX_ITEMS} pairs of geoms that may meet", len(pairs) > MAX_ITEMS
+    yield f"more than {_MAX_CONTACTS} possible contacts", num_contacts > _MAX_CONTACTS
+    is_long = model.opt.ccd_iterations > _MAX_CONVEX_STEPS
+    yield f"more than {_MAX_CONVEX_STEPS} ccd_iterations", has_convex and is_long
+    yield "the flag nativeccd disabled", has_convex and flags.is_off(model, "nativeccd")
+
+
+def num_parts(model: Any) -> int:
+    """Returns how many parts the pairs of geoms that may meet have, that can be told apart."""
+    return sum(NUM_PARTS.get(geom_kinds(model, pair), 1) for pair in meeting(model))
 
 
 def _geom_name(kind: int) -> str:

@@ -17,7 +17,7 @@ from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.physics import sensors
 from mjx_reinforce.engine.physics.early_stop import stops_early
 from mjx_reinforce.engine.scalar import UnsupportedPrimitive
-from mjx_reinforce.engine.team import cables, draws, flags, last_pass, records, supported
+from mjx_reinforce.engine.team import cables, draws, flags, hulls, last_pass, records, supported
 from mjx_reinforce.engine.team.contact_kinds import (
     MIN_VALUE,
     ContactKind,
@@ -34,6 +34,7 @@ from mjx_reinforce.engine.team.supported import (
     ELLIPSOID,
     FREE,
     HINGE,
+    MESH,
     PLANE,
     SLIDE,
     SPHERE,
@@ -59,12 +60,20 @@ _HEADERS = [
     "rounds",
     "boxes",
     "cylinders",
+    "hulls",
     "two_boxes",
+    "support",
+    "gjk",
+    "epa",
+    "faces",
+    "convex",
     "collision",
     "equality",
     "elimination",
     "newton",
+    "islands",
     "early_stop",
+    "no_slip",
     "touch",
     "report",
     "free_bodies",
@@ -77,7 +86,7 @@ NUM_NEAR = 8
 #: How a degree of freedom moves what it carries, by ``device/kinematics.h``.
 _TURNS, _SHIFTS, _SHIFTS_IN_THE_WORLD = range(3)
 #: Geoms by the enum of ``device/rounds.h``.
-_GEOM_KINDS = {PLANE: 0, SPHERE: 1, CAPSULE: 1, BOX: 2, CYLINDER: 3, ELLIPSOID: 4}
+_GEOM_KINDS = {PLANE: 0, SPHERE: 1, CAPSULE: 1, ELLIPSOID: 2, CYLINDER: 3, BOX: 4, MESH: 5}
 _NO_LIMIT = 1e30
 
 
@@ -109,7 +118,7 @@ def far_words(mj_model: MjModel, num_near: int = NUM_NEAR, random: Collection[st
     sizes = _Tables(mj_model, num_near, random).constants
     # The Contact of state.h.
     contact_words = 13 + 5 * sizes["CD"] + sizes["ELLIPTIC"] + 5 * sizes["DRAWS_FRICTION"]
-    words = max(0, int(sizes["NI"] - sizes["NEAR"])) * int(contact_words)
+    words = max(0, int(sizes["NC"] - sizes["NEAR"])) * int(contact_words)
     return words + words % 2  # numbers of 8 bytes may follow
 
 
@@ -135,6 +144,7 @@ class _Tables:
     ints, masks, reals: the arrays of the struct Model, which the lanes read
     soft: the rows of the softnesses that were met, with their numbers
     random: the names of fields that differ from episode to episode
+    hulls: of the meshes that may meet something
     layout: of the tables that such fields change
     """
 
@@ -191,6 +201,7 @@ class _Tables:
             table = ", ".join(str(int(x)) for x in values) or "0"
             lines.append(f"DEV constexpr int {name}(int i) {{")
             lines.append(f"  constexpr int table[] = {{{table}}};\n  return table[i];\n}}")
+        lines += hulls.text(self.hulls)
         lines.append("struct Fixed {")
         lines.append("  real timestep, smallest_gain;")
         empty = []
@@ -241,7 +252,20 @@ class _Tables:
         self.constants["STEPS"] = model.opt.iterations
         self.constants["LENGTHS"] = model.opt.ls_iterations
         self.constants["WARM"] = not flags.is_off(model, "warmstart")
-        self.constants["ONE_ISLAND"] = flags.is_off(model, "island")
+        is_one = flags.is_off(model, "island")
+        self.constants["ONE_ISLAND"] = is_one
+        self.constants["NOSLIP"] = model.opt.noslip_iterations
+        self.real_constants["NOSLIP_TOLERANCE"] = float(model.opt.noslip_tolerance)
+        # The degrees of freedom of each tree, where C solves the trees that rows join apart.
+        trees = np.asarray(model.dof_treeid)
+        masks = [sum(1 << int(dof) for dof in np.flatnonzero(trees == x)) for x in sorted({*trees})]
+        is_approximate = stops_early(model) or model.opt.noslip_iterations > 0
+        has_islands = is_approximate and not is_one and len(masks) > 1
+        self.constants["NTREES"] = len(masks) if has_islands else 1
+        fixed_links = [0] * (1 + model.nmocap)
+        links = [masks[trees[dof]] for dof in model.jnt_dofadr] + fixed_links
+        self.masks["tree_dofs"] = masks if has_islands else []
+        self.masks["link_tree"] = links if has_islands else []
         self.real_constants["TOLERANCE"] = float(model.opt.tolerance)
         self.real_constants["LENGTH_TOLERANCE"] = float(model.opt.ls_tolerance)
         self.real_constants["MEAN_TRACE"] = float(model.stat.meaninertia * model.nv)
@@ -618,28 +642,45 @@ class _Tables:
         """Makes the tables of equality constraints."""
         model = self.model
         eq_kinds = np.where(model.eq_active0, model.eq_type, -1)
+        weld_eqs = np.flatnonzero(eq_kinds == _C.mjtEq.mjEQ_WELD)
         connect_eqs = np.flatnonzero(eq_kinds == _C.mjtEq.mjEQ_CONNECT)
+        connect_eqs = np.concatenate([connect_eqs, weld_eqs])
         joint_eqs = np.flatnonzero(eq_kinds == _C.mjtEq.mjEQ_JOINT)
         self.constants["NCONNECT"] = len(connect_eqs)
-        self.constants["NE"] = 3 * len(connect_eqs) + len(joint_eqs)
+        self.constants["NWELD"] = len(weld_eqs)
+        self.constants["NE"] = 3 * len(connect_eqs) + 3 * len(weld_eqs) + len(joint_eqs)
         links = []
+        turns = []
         places = []
         bodies = []
         for equality in connect_eqs:
             ends = (model.eq_obj1id[equality], model.eq_obj2id[equality])
             anchors = model.eq_data[equality, :6].reshape(2, 3)
+            # A weld has them the other way around, and a relative pose.
+            is_weld = model.eq_type[equality] == _C.mjtEq.mjEQ_WELD
+            quats = np.array([model.eq_data[equality, 6:10], [1, 0, 0, 0]])
+            if is_weld:
+                anchors = anchors[::-1]
             # Between sites there are no anchors in eq_data: the sites are.
             if model.eq_objtype[equality] == _C.mjtObj.mjOBJ_SITE:
                 anchors = model.site_pos[list(ends)]
+                quats = model.site_quat[list(ends)]
                 ends = model.site_bodyid[list(ends)]
             frames = [self.frames[body] for body in ends]
             bodies.append([int(body) for body in ends])
             links.append([self._link_number(frame.link) for frame in frames])
             places.append([frame.place(x) for frame, x in zip(frames, anchors, strict=True)])
+            if is_weld:
+                ends_quats = [times(x.quat, quat) for x, quat in zip(frames, quats, strict=True)]
+                turns.append([rotation(quat) for quat in ends_quats])
         self.ints["connect_link"] = links
         self.ints["connect_body"] = bodies
         self.reals["connect_at"] = places
         self.reals["connect_weight"] = [model.body_invweight0[x, 0].sum() for x in bodies]
+        weld_bodies = bodies[len(bodies) - len(weld_eqs) :]
+        self.reals["weld_turn"] = turns
+        self.reals["weld_scale"] = model.eq_data[weld_eqs, 10]
+        self.reals["weld_weight"] = [model.body_invweight0[x, 1].sum() for x in weld_bodies]
         self.ints["connect_soft"] = self._equality_softs(connect_eqs)
         # A joint alone is held at a value: its second is -1.
         joints = np.stack([model.eq_obj1id[joint_eqs], model.eq_obj2id[joint_eqs]], 1)
@@ -686,6 +727,10 @@ class _Tables:
         has_friction = "geom_friction" in self.random
         kind_numbers: dict[tuple[ContactKind, int], int] = {}
         kind_pairs = 0
+        num_contacts = 0
+        # Where parts are many, their table leaves little shared memory, and going through it takes
+        # long.
+        is_whole = supported.num_parts(model) > supported.MAX_ITEMS
         items = []
         item_kinds = []
         weights = []
@@ -698,9 +743,13 @@ class _Tables:
                 # Of an edge of the pyramid, which pushes along a tangent, too.
                 friction = kind.friction[0]
                 weight *= 2 * friction**2 / model.opt.impratio * (1 + friction**2)
-            flat, other = geom_types = supported.geom_kinds(model, pair)
-            kind_pairs |= 1 << (8 * _GEOM_KINDS[flat] + _GEOM_KINDS[other])
-            for part in range(supported.NUM_PARTS[geom_types]):
+            geom_types = supported.geom_kinds(model, pair)
+            flat, other = (_GEOM_KINDS[x] for x in geom_types)
+            kind_pairs |= 1 << (other * (other + 1) // 2 + flat)
+            # The convex collider finds all contacts of a pair at once.
+            num_parts = supported.NUM_PARTS.get(geom_types, 1)
+            num_contacts += supported.CONVEX_CONTACTS.get(geom_types, num_parts)
+            for part in [num_parts - 1] if is_whole else range(num_parts):
                 items.append(records.packed_item(geom_ids[pair.geom1], geom_ids[pair.geom2], part))
                 item_kinds.append(number)
                 weights.append(weight)
@@ -716,6 +765,19 @@ class _Tables:
         self.ints["kind_mix"] = [mix for _, mix in kind_numbers] if has_friction else []
         self.geoms = np.array(geoms, int)
         kinds = [kind for kind, _ in kind_numbers]
+        self._kinds(kinds)
+        self.constants["KIND_PAIRS"] = kind_pairs
+        self.constants["NI"] = len(items)
+        self.constants["WHOLE_PAIRS"] = int(is_whole)
+        self.constants["NC"] = num_contacts
+        self.constants["NEAR"] = max(1, min(num_near, num_contacts))
+        self._convex([pair for pair, _ in pairs], kinds)
+        self.constants["CD"] = max((x.dim for x in kinds), default=1)
+        self.constants["NG"] = max(len(geoms), 1)
+        self._geoms(self.geoms)
+
+    def _kinds(self, kinds: list[ContactKind]) -> None:
+        """Makes the tables of what contacts of several pairs have in common."""
         self.ints["kind_dim"] = [x.dim for x in kinds]
         self.ints["kind_soft"] = [self._number(x.softness) for x in kinds]
         self.reals["kind_margin"] = [x.margin for x in kinds]
@@ -724,15 +786,23 @@ class _Tables:
         self.ints["kind_soft_friction"] = []
         if self._is_elliptic():
             # C's regularized friction of the cone.
-            root = np.sqrt(max(model.opt.impratio, MIN_VALUE))
+            root = np.sqrt(max(self.model.opt.impratio, MIN_VALUE))
             self.reals["kind_mu"] = [x.friction[0] / root for x in kinds]
             self.ints["kind_soft_friction"] = [self._number(x.friction_softness) for x in kinds]
-        self.constants["KIND_PAIRS"] = kind_pairs
-        self.constants["NI"] = len(items)
-        self.constants["NEAR"] = max(1, min(num_near, len(items)))
-        self.constants["CD"] = max((x.dim for x in kinds), default=1)
-        self.constants["NG"] = max(len(geoms), 1)
-        self._geoms(self.geoms)
+
+    def _convex(self, pairs: Iterable[supported.GeomPair], kinds: Iterable[ContactKind]) -> None:
+        """Makes the tables of the convex collider."""
+        model = self.model
+        all_types = [supported.geom_kinds(model, x) for x in pairs]
+        convex_types = [x for x in all_types if x in supported.CONVEX_CONTACTS]
+        num_contacts = [supported.CONVEX_CONTACTS[x] for x in convex_types]
+        geom_kinds = {_GEOM_KINDS[x] for types in convex_types for x in types}
+        self.constants["CONVEX_KINDS"] = sum(1 << x for x in geom_kinds)
+        self.constants["CONVEX_CONTACTS"] = max(num_contacts, default=0)
+        self.constants["MORE_CONTACTS"] = not flags.is_off(model, "multiccd")
+        self.constants["CONVEX_STEPS"] = model.opt.ccd_iterations
+        self.real_constants["CONVEX_TOLERANCE"] = float(model.opt.ccd_tolerance)
+        self.reals["kind_gap"] = [x.gap for x in kinds] if convex_types else []
 
     def _geoms(self, geoms: np.ndarray) -> None:
         """Makes the tables of the geoms that may meet."""
@@ -756,10 +826,17 @@ class _Tables:
         self.reals["geom_half"] = np.where(has_length, size[:, 1], 0)
         self.reals["geom_reach"] = model.geom_rbound[geoms]
         # Shared memory is scarce: what has no turn about the axis needs neither that nor sizes.
-        self.reals["geom_turn"] = []
-        self.reals["geom_size"] = []
-        if np.isin(types, (BOX, CYLINDER, ELLIPSOID)).any():
-            self.reals |= {"geom_turn": turns, "geom_size": size}
+        has_size = np.isin(types, (BOX, CYLINDER, ELLIPSOID)).any()
+        has_meshes = MESH in types
+        self.reals["geom_turn"] = turns if has_size or has_meshes else []
+        self.reals["geom_size"] = size if has_size else []
+        self.hulls = hulls.of_geoms(model, geoms)
+        meshes = model.geom_dataid[geoms]
+        numbers = [self.hulls.numbers.get(int(x), -1) for x in meshes]
+        self.ints["geom_hull"] = numbers if has_meshes else []
+        # Of a box, and of the polygon that a cylinder's end is.
+        self.constants["CONVEX_SIDES"] = max(16, *(x for _, x in self.hulls.face_corners), 0)
+        self.constants["CONVEX_DEGREE"] = max(3, hulls.degree(self.hulls))
 
     def _sensors(self) -> None:
         """Makes the tables of sensors of touch."""

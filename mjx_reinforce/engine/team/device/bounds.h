@@ -38,6 +38,12 @@ struct Bounds {
       loss_reference = -soft.damping * v;
     }
   }
+  // Whether there is a row, whether it pushes or not.
+  DEV bool some() const {
+    bool has_row = LOSSES && loss_constraint_mass > 0;
+    for (int n = 0; n < LIMITS; n++) has_row |= limit_constraint_mass[n] > 0;
+    return has_row;
+  }
   // Adds the gradient at an acceleration, and the stiffness.
   DEV void push(real qacc, real& gradient, real& stiffness) const {
     for (int n = 0; n < LIMITS; n++) {

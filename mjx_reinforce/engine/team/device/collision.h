@@ -2,9 +2,9 @@
 // them are looked at closely.
 #pragma once
 
-// The contact of an item, if its distance is below the margin.
-DEV Touch touch_of(const Model& M, const State& s, int item, real margin) {
-  const int a = M.item[item].first(), b = M.item[item].second(), part = M.item[item].part();
+// The contact of a part of an item, if its distance is below the margin.
+DEV Touch touch_of(const Model& M, const State& s, int item, int part, real margin) {
+  const int a = M.item[item].first(), b = M.item[item].second();
   Touch c;
   for (int k = 0; k < 3; k++) c.tangent[k] = 0;
   const int below = M.geom_kind[a], above = M.geom_kind[b];
@@ -23,6 +23,8 @@ DEV Touch touch_of(const Model& M, const State& s, int item, real margin) {
     touch_sphere_and_cylinder(M, s, a, b, c);
   } else if (are(PLANE, ELLIPSOID)) {
     touch_ellipsoid_on_plane(M, s, a, b, c);
+  } else if (are(PLANE, MESH)) {
+    touch_hull_on_plane(M, s, a, b, part, margin, c);
   } else if (below == PLANE) {
     const Quad q = s.geom_place[b], axis = s.geom_axis[b];
     const real half = M.geom_half[b], along = part ? -half : half;
@@ -36,26 +38,6 @@ DEV Touch touch_of(const Model& M, const State& s, int item, real margin) {
     touch_rounds(M, s, a, b, c);
   }
   return c;
-}
-
-// The axes of a contact as mju_makeFrame has them.
-DEV void make_frame(real* frame, const Touch& c) {
-  real along[3] = {c.tangent[0], c.tangent[1], c.tangent[2]};
-  if (dot(along, along) < real(.25)) {
-    const bool y = fabs(c.normal[1]) < real(.5);
-    along[0] = 0; along[1] = y; along[2] = !y;
-  }
-  const real across = dot(c.normal, along);
-  for (int k = 0; k < 3; k++) along[k] -= across * c.normal[k];
-  const real square = dot(along, along);
-  const bool upright = square < real(1e-30);  // a capsule that stands on a plane
-  const real scale = inverse_root(upright ? real(1) : square);
-  if (upright) along[0] = 1;
-  for (int k = 0; k < 3; k++) {
-    frame[k] = c.normal[k];
-    frame[3 + k] = scale * along[k];
-  }
-  cross(frame + 6, frame, frame + 3);
 }
 
 // A contact, what its rows want included (mj_instantiateContact, mj_referenceConstraint).
@@ -107,20 +89,42 @@ DEV void collide(const Team& t, const Model& M, State& s) {
       const bool has_item = lane < waiting;
       const int queued_item = s.queue[lane];
       bool touches = false;
-      Touch touch;
+      int contacts = 1;
+      Touch touch[MOST_TOUCHES];
       if (has_item) {
         const real margin = M.kind_margin[M.item_kind[queued_item]];
-        touch = touch_of(M, s, queued_item, margin);
-        touches = touch.distance < margin;
+        if (CONVEX_CONTACTS && meet_as_convex(M, M.item[queued_item])) {
+          contacts = touch_convex(M, s, queued_item, margin, touch);
+          touches = contacts > 0;
+        } else if (WHOLE_PAIRS) {
+          contacts = 0;
+          const int last_part = M.item[queued_item].part();
+          LOOP for (int part = 0; part <= last_part && contacts < MOST_TOUCHES; part++) {
+            touch[contacts] = touch_of(M, s, queued_item, part, margin);
+            contacts += touch[contacts].distance < margin;
+          }
+          touches = contacts > 0;
+        } else {
+          touch[0] = touch_of(M, s, queued_item, M.item[queued_item].part(), margin);
+          touches = touch[0].distance < margin;
+        }
       }
-      const unsigned touching_lanes = t.ballot(touches);
-      if (touches) {
-        const int at = num_contacts + count(touching_lanes & ((1u << lane) - 1));
-        const Contact contact = contact_of(M, s, queued_item, touch);
-        // Not by contact_at: stores through a reference to either would be to no known memory.
-        if (!FAR || at < NEAR) s.contacts[at] = contact; else s.far[at - NEAR] = contact;
+      // In the order of the items, whatever the number of lanes: no_slip goes through them in it.
+      unsigned touching_lanes[MOST_TOUCHES];
+      UNROLL for (int n = 0; n < MOST_TOUCHES; n++)
+        touching_lanes[n] = t.ballot(n > 0 ? touches && n < contacts : touches);
+      LOOP for (int n = 0; n < MOST_TOUCHES; n++) {
+        if (n > 0) touches &= n < contacts;
+        if (touches) {
+          int at = num_contacts + n;
+          UNROLL for (int k = 0; k < MOST_TOUCHES; k++)
+            at += count(touching_lanes[k] & ((1u << lane) - 1));
+          const Contact contact = contact_of(M, s, queued_item, touch[n]);
+          // Not by contact_at: stores through a reference to either would be to no known memory.
+          if (!FAR || at < NEAR) s.contacts[at] = contact; else s.far[at - NEAR] = contact;
+        }
       }
-      num_contacts += count(touching_lanes);
+      UNROLL for (int n = 0; n < MOST_TOUCHES; n++) num_contacts += count(touching_lanes[n]);
       const int next = s.queue[W + lane];
       t.sync();
       waiting -= W;

@@ -210,12 +210,21 @@ DEV void damp_rest(const Team& t, const Model& M, State& s, Search& search) {
 // Replaces newton, and returns as that.
 DEV int newton_as_c(const Team& t, const Model& M, State& s) {
   Search search(t, M, s);
-  real trace = 0, improvement = 0;
-  UNROLL for (int r = 0; r < ROWS_A_LANE; r++) trace += search.diagonal[r];
-  trace = t.sum(trace);
-  const real scale = 1 / (ONE_ISLAND ? MEAN_TRACE : trace);
-  bool settled = false;
-  int steps = -1;  // the first goes to the acceleration without rows, if that costs less
+  // Of the island that is solved: first of all, and last of all, all is one.
+  Mask island = EVERYTHING, left = EVERYTHING;
+  bool settled = false, loose = false;
+  real scale = 0, improvement = 0;
+  const auto enter = [&](Mask entered) {
+    island = entered;
+    improvement = 0;
+    real trace = 0;
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
+      if (!ISLANDS || island >> (t.lane + r * W) & 1) trace += search.diagonal[r];
+    trace = t.sum(trace);
+    scale = 1 / (ONE_ISLAND ? MEAN_TRACE : trace);
+  };
+  enter(EVERYTHING);
+  int steps = -1, earlier = 0;  // the first goes to where no row pushes, if that costs less
   LOOP for (;; steps++) {
     const bool starts = steps < 0, damps = IMPLICIT && settled;
     Rows h;
@@ -230,6 +239,8 @@ DEV int newton_as_c(const Team& t, const Model& M, State& s) {
     } else if (!starts) {
       add_rows(t, M, s, h, search.gradient);
     }
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
+      if (ISLANDS && !damps && !(island >> (t.lane + r * W) & 1)) search.gradient[r] = 0;
     load_right_side(t, s, search, h);
     solve(t, s, h, search.direction);
     if (damps) break;
@@ -254,12 +265,15 @@ DEV int newton_as_c(const Team& t, const Model& M, State& s) {
       settled = steps == 0 ? flat && low : flat || low || slow;
     }
     Mark mark = {0, 0, 0, 0};
-    if (starts || (!settled && norm >= real(1e-15))) {
+    if (starts || (!loose && !settled && norm >= real(1e-15))) {
       const real small = TOLERANCE * LENGTH_TOLERANCE * norm / scale;
       mark = line_as_c(t, M, s, search, step, along, small, starts);
     }
     if (starts) {
       if (WARM && !(mark.cost < 0)) mark.length = 0;
+    } else if (loose) {  // no row changes on the way to the optimum
+      mark.length = 1;
+      settled = true;
     } else {
       settled |= mark.length == 0 || steps + 1 >= STEPS;
       improvement = -mark.cost;
@@ -268,8 +282,17 @@ DEV int newton_as_c(const Team& t, const Model& M, State& s) {
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
       search.imbalance[r] += mark.length * inertia[r];
     move_along(t, s, search, mark.length);
+    if (ISLANDS && (starts || settled)) {
+      left = starts ? EVERYTHING >> (8 * int(sizeof(Mask)) - NV) : left & ~island;
+      const Mask rest = starts ? loose_trees(t, M, s, search) : 0;
+      loose = rest != 0;
+      settled = left == 0;
+      if (left) enter(loose ? rest : next_island(t, M, s, search, left));
+      earlier += steps + 1;
+      steps = -1;
+    }
     if (settled && !IMPLICIT) break;
   }
   store_acceleration(t, s, search);
-  return steps + 1;
+  return earlier + steps + 1;
 }

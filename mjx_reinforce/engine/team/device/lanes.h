@@ -2,16 +2,20 @@
 #pragma once
 #ifdef __CUDACC__
 #define DEV __device__ __forceinline__
+#define CALL static __device__ __noinline__
 #define UNROLL _Pragma("unroll")
 #define LOOP _Pragma("unroll 1")
+#define TABLE static __device__ const
 typedef float real;
 #else
 #include <cmath>
 #include <cstddef>
 #include <cstring>
 #define DEV inline
+#define CALL static inline
 #define UNROLL
 #define LOOP
+#define TABLE static const
 #ifndef REAL
 #define REAL double
 #endif

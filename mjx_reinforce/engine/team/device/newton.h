@@ -235,6 +235,8 @@ DEV void store_acceleration(const Team& t, State& s, const Search& search) {
   t.sync();
 }
 
+DEV void no_slip(const Team& t, const Model& M, State& s, Search& search);
+
 // Replaces s.qacc_warmstart by the acceleration (MuJoCo's mj_solNewton); if damping is implicit,
 // s.direction becomes what that adds to it. Returns the number of steps.
 DEV int newton(const Team& t, const Model& M, State& s) {
@@ -278,6 +280,7 @@ DEV int newton(const Team& t, const Model& M, State& s) {
       UNROLL for (int r = 0; r < ROWS_A_LANE; r++) search.imbalance[r] += length * inertia[r];
     }
     move_along(t, s, search, length);
+    if (settled && NOSLIP) no_slip(t, M, s, search);
     if (settled && !IMPLICIT) break;
   }
   store_acceleration(t, s, search);

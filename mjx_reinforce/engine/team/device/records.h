@@ -3,9 +3,9 @@
 #pragma once
 
 // A part of a pair of geoms that makes one contact at most: an end of a capsule, a corner of a box.
-// The geoms are numbered among those that may meet.
+// The geoms are numbered among those that may meet. With WHOLE_PAIRS an item is all of a pair.
 struct Item {
-  int packed;  // 12 bits of a geom, 12 bits of the other one, the part's number
+  int packed;  // 12 bits of a geom, 12 bits of the other one, the part's number or the last one's
   DEV constexpr int first() const { return packed & 0xfff; }
   DEV constexpr int second() const { return packed >> 12 & 0xfff; }
   DEV constexpr int part() const { return packed >> 24 & 7; }
@@ -53,3 +53,20 @@ struct FluidBody {
 struct Compensation { real moment[3], mass; };
 // Along the two tangents, about the normal, about the two tangents.
 struct Friction { real along[5]; };
+
+// The hull of a mesh, in memory that all teams read (hulls.py). What has no room in a struct is a
+// list from its place in hull_neighbor, hull_faces_of or hull_corner on; the first two end with -1.
+// These number vertices and faces across all hulls.
+struct alignas(16) HullVertex {
+  float at[3];            // in the frame of the mesh, which MuJoCo has in float32, too (m)
+  int neighbors;          // of hull_neighbor, in MuJoCo's order
+  int faces;              // of hull_faces_of
+};
+struct HullFace {
+  real normal[3];
+  int corners, count;     // of hull_corner, in order around the face, and how many
+};
+struct Hull {
+  int first, searched;    // a vertex; how many from there on are looked at one by one, or 0
+  int seeds[27];          // vertices to climb from, by directions (MuJoCo's mesh_extrema)
+};

@@ -1,9 +1,12 @@
 // Contacts of spheres, capsules and planes.
 #pragma once
 
-enum { PLANE, ROUND, BOX, CYLINDER, ELLIPSOID };  // geoms; round are spheres and capsules
-// Whether the model has two such geoms that may meet.
-DEV constexpr bool may_meet(int flat, int other) { return KIND_PAIRS >> (8 * flat + other) & 1; }
+// Geoms in MuJoCo's order; round are spheres and capsules.
+enum { PLANE, ROUND, ELLIPSOID, CYLINDER, BOX, MESH };
+// Whether the model has two such geoms that may meet; the flatter one comes first in that order.
+DEV constexpr bool may_meet(int flat, int other) {
+  return KIND_PAIRS >> (other * (other + 1) / 2 + flat) & 1;
+}
 
 struct Touch {
   real distance, at[3], normal[3], tangent[3];
@@ -60,4 +63,24 @@ DEV void touch_rounds(const Model& M, const State& s, int a, int b, Touch& c) {
     q[k] = pb.x[k] + on_b * zb.x[k];
   }
   touch_spheres(c, p, M.geom_radius[a], q, M.geom_radius[b]);
+}
+
+// The axes of a contact as mju_makeFrame has them.
+DEV void make_frame(real* frame, const Touch& c) {
+  real along[3] = {c.tangent[0], c.tangent[1], c.tangent[2]};
+  if (dot(along, along) < real(.25)) {
+    const bool y = fabs(c.normal[1]) < real(.5);
+    along[0] = 0; along[1] = y; along[2] = !y;
+  }
+  const real across = dot(c.normal, along);
+  for (int k = 0; k < 3; k++) along[k] -= across * c.normal[k];
+  const real square = dot(along, along);
+  const bool upright = square < real(1e-30);  // a capsule that stands on a plane
+  const real scale = inverse_root(upright ? real(1) : square);
+  if (upright) along[0] = 1;
+  for (int k = 0; k < 3; k++) {
+    frame[k] = c.normal[k];
+    frame[3 + k] = scale * along[k];
+  }
+  cross(frame + 6, frame, frame + 3);
 }

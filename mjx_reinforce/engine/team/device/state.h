@@ -32,7 +32,7 @@ DEV constexpr int quads(int numbers) { return ((numbers + 3) / 4) | 1; }
 constexpr int QUADS = quads(SIDE + (ROWS_A_LANE == 1));
 constexpr int STRIDE = 4 * QUADS;
 // Contacts that the state has no room for.
-constexpr int FAR = NI > NEAR ? NI - NEAR : 0;
+constexpr int FAR = NC > NEAR ? NC - NEAR : 0;
 
 // What a task may read after a step; the program that plays it says what it reads.
 // SEEN_ is of its last forward pass.
@@ -87,6 +87,8 @@ struct alignas(4 * sizeof(real)) State : Drawn {
   Some<Quad[QUADS], NE> general;  // J of rows of no contact and no single dof
   Some<real, NE> general_residual, general_change, general_constraint_mass;
   Some<Cable, NCABLE> cables;
+  Some<Quad[QUADS], NOSLIP ? SIDE : 0> inverse;  // of M
+  Some<real, NOSLIP && LOSSES ? NV : 0> loss_force;
   union {
     Quad rows[SIDE][QUADS];  // below the diagonal M, above it what eliminates
     Quad subtree[NL][5];     // inertia [10], force [6]

@@ -31,7 +31,7 @@ DEV bool meets_zone(const real* size, int round_axes, const real* from, const re
 template <class Tables> DEV void feel(const Team& t, const Tables& M, State& s) {
   const int lane = t.lane;
   EACH(n, NTOUCH) s.touch[n] = 0;
-  if (!reports(CFRC_EXT)) each_contact(t, s, [&](Contact& c) { push(M, c); });
+  if (!reports(CFRC_EXT) && !NOSLIP) each_contact(t, s, [&](Contact& c) { push(M, c); });
   t.sync();
   all_contacts(t, s, [&](const Contact& c) {
     if (!(c.force[0] > 0)) return;
