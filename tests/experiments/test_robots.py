@@ -5,8 +5,10 @@ import itertools
 import pytest
 
 from experiments.checks.robots import __main__ as robots
-from experiments.checks.robots import page, playing, teams
+from experiments.checks.robots import gpu, page, playing, teams
 from experiments.kit import device_code, rows
+from experiments.speed.benchmark import rows as benchmark_rows
+from experiments.speed.benchmark.robots import make
 
 #: A slide that a motor pushes against a wall; {} are options.
 MODEL = """
@@ -83,6 +85,60 @@ def test_teams_are_compared_with_c_mujoco_and_counted(tmp_path, capsys):
     table = capsys.readouterr().out.splitlines()
     assert "| Menagerie's files for MJX | 1 | 0 | 0 | 0 | 0 | 0 |" in table
     assert table[-1] == "| all | 2 | 1 | 1 | 1 | 1 | 1 |"
+
+
+def test_speeds_of_a_gpu_are_beside_what_teams_cover(tmp_path, monkeypatch):
+    model = MODEL.format(option="", actuator=MOTOR)
+    folder = tmp_path / "mujoco_menagerie"
+    team_rows = []
+    for name in ("slow", "fast", "refused"):
+        (folder / name).mkdir(parents=True)
+        (folder / name / "scene.xml").write_text(model)
+        row = dict.fromkeys(teams.COLUMNS, "") | {"nu": "1", "nv": "1"}
+        row |= {"package": "mujoco_menagerie", "model": f"{name}/scene.xml"}
+        row |= {"verdict": "accepted", "error20": "1e-12"}
+        if name == "refused":
+            row |= {"verdict": "refused", "cause": "the model has a plugin", "error20": ""}
+        team_rows.append(row)
+    rows.write(tmp_path / "teams.csv", team_rows)
+    called = []
+
+    def conduct(settings):
+        called.append(settings.tasks)
+        speeds = {"native": 6e5, "MuJoCo Warp": 1e5}
+        timed = [
+            {"task": task, "engine": engine, "batch": batch, "steps": 50}
+            | {"env_steps_per_second": [speed, speed]}
+            for task in settings.tasks[:1]  # the other one fails
+            for engine, speed in speeds.items()
+            for batch in settings.batches
+        ]
+        benchmark_rows.append(settings.csv, timed)
+
+    monkeypatch.setattr(gpu.benchmark, "conduct", conduct)
+    timed = tmp_path / "gpu.csv"
+    for seconds in (200.0, 600.0, 600.0):  # what failed is tried again, and then left out
+        gpu.measure(timed, tmp_path, tmp_path / "teams.csv", seconds, "")
+    names = [[task.rpartition("/mujoco_menagerie/")[2] for task in tasks] for tasks in called]
+    assert names == [["slow/scene.xml", "fast/scene.xml"], ["fast/scene.xml"]]
+    gpu.write(tmp_path / "page.csv", tmp_path / "teams.csv", timed, tmp_path)
+    table = gpu.robots(rows.read(tmp_path / "page.csv")).splitlines()
+    assert (
+        "| slow/scene.xml | 1 | 1e-12 |  | 600,000 | 100,000 | 600,000 | 100,000 | 6.0 | 6.0 |"
+        in table
+    )
+    assert "| refused/scene.xml | 1 | a plugin |  |  |  |  |  |  |  |" in table
+    assert "| Menagerie's robots | 3 | 2 | 2 | 6.0 |" in gpu.summary(
+        rows.read(tmp_path / "page.csv")
+    )
+
+
+def test_a_robot_of_the_gpus_rows_plays(tmp_path):
+    (tmp_path / "model.xml").write_text(MODEL.format(option="", actuator=MOTOR))
+    env = make(gpu.task_of(tmp_path / "model.xml"))
+    state = env.step(env.reset(playing.jax.random.key(0)), playing.np.ones(1))
+    assert state.obs.shape == (2,)
+    assert playing.np.isfinite(state.reward)
 
 
 @pytest.mark.parametrize(

@@ -5,12 +5,16 @@
     python -m experiments.checks.robots speed ROWS.csv FOLDER
     python -m experiments.checks.robots page ROWS.csv
     python -m experiments.checks.robots teams TEAMS.csv FOLDER
+    python -m experiments.checks.robots gpu GPU.csv FOLDER --listed TEAMS.csv --seconds 560
+    python -m experiments.checks.robots gpu-page GPU.csv FOLDER --listed TEAMS.csv
 
 FOLDER has a folder for each package, such as pip has unpacked. Each model is judged by a process of
 its own, with limits of time and memory. ROWS.csv gets a row each, and a model that has its row is
 skipped, so a run can be cut off and continued. ``page`` writes docs/robots.csv and docs/robots.md.
 ``teams`` asks which models the device code of teams covers, compares what it covers with C MuJoCo,
-and prints the counts; its rows, of other columns (see teams.py), have a file of their own.
+and prints the counts; its rows, of other columns (see teams.py), have a file of their own. ``gpu``
+times these models on a GPU, beside MuJoCo Warp where it is installed, and is to be called again
+until none is left; ``gpu-page`` writes docs/robots_gpu.csv and the page.
 """
 
 import dataclasses
@@ -21,7 +25,7 @@ from typing import Any, Literal
 
 import tyro
 
-from experiments.checks.robots import models, page, teams
+from experiments.checks.robots import gpu, models, page, teams
 from experiments.checks.robots.judging import Question, judged
 from experiments.kit import rows
 
@@ -36,7 +40,7 @@ _NOT_PLAYED = ("no model", "same mechanism", "no actuators")
 class Settings:
     """Judge models that others wrote."""
 
-    phase: tyro.conf.Positional[Literal["equality", "speed", "page", "teams"]]
+    phase: tyro.conf.Positional[Literal["equality", "speed", "page", "teams", "gpu", "gpu-page"]]
     """What to do."""
     output: tyro.conf.Positional[Path]
     """The rows."""
@@ -45,9 +49,11 @@ class Settings:
     engine: Literal["auto", "mujoco"] = "auto"
     """Whose equality is judged."""
     listed: Path | None = None
-    """A CSV file with the columns package and model: no other is judged."""
+    """A CSV file with the columns package and model: no other is judged. Of gpu, rows of teams."""
     seconds: float = 180.0
-    """A model may take so long."""
+    """A model may take so long; of gpu, all of them together."""
+    commit: str = ""
+    """Of the code that gpu measures."""
     gigabytes: float = 32.0
     """A model may reserve so much memory, most of which the arenas of large models never touch."""
 
@@ -108,6 +114,16 @@ def main(settings: Settings) -> None:
     """Does what is asked for."""
     if settings.phase == "page":
         page.write(rows.read(settings.output))
+    elif settings.phase in ("gpu", "gpu-page"):
+        if settings.listed is None:
+            raise ValueError(f"{settings.phase} needs --listed, the rows of teams")
+        if settings.phase == "gpu":
+            gpu.measure(
+                settings.output, settings.folder, settings.listed, settings.seconds, settings.commit
+            )
+        else:
+            gpu.write(page.GPU_CSV, settings.listed, settings.output, settings.folder)
+            page.fill()
     elif settings.phase == "teams":
         teams.measure(settings.output, settings.folder, settings.seconds)
     else:

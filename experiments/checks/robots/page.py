@@ -6,12 +6,14 @@ import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from experiments.checks.robots import gpu
 from experiments.checks.robots.playing import EQUAL
 from experiments.kit import rows
 from experiments.kit.markdown import filled, table
 from experiments.kit.places import ROOT
 
 CSV = ROOT / "docs" / "robots.csv"
+GPU_CSV = ROOT / "docs" / "robots_gpu.csv"
 PAGE = ROOT / "docs" / "robots.md"
 #: Columns of docs/robots.csv.
 COLUMNS = ("package", "model", "engine", "why", "verdict", "error", "cause", "in_c_mujoco")
@@ -158,11 +160,19 @@ def _package(package: str, models: Sequence[Mapping[str, Any]]) -> Iterator[str]
 def page(text: str, models: Sequence[Mapping[str, Any]]) -> str:
     """Returns docs/robots.md with the tables of these models."""
     makers = {"totals": totals, "equality": equality, "engines": engines, "robots": robots}
-    return filled(text, {name: lambda maker=maker: maker(models) for name, maker in makers.items()})
+    tables = {name: lambda maker=maker: maker(models) for name, maker in makers.items()}
+    of_gpu = rows.read(GPU_CSV)
+    tables |= {"gpu": lambda: gpu.summary(of_gpu), "gpu_robots": lambda: gpu.robots(of_gpu)}
+    return filled(text, tables)
 
 
 def write(raw_rows: Sequence[Mapping[str, Any]]) -> None:
     """Writes docs/robots.csv and the tables of docs/robots.md."""
-    models = merged(raw_rows)
-    rows.write(CSV, models)
-    PAGE.write_text(page(PAGE.read_text(encoding="utf-8"), models), encoding="utf-8")
+    rows.write(CSV, merged(raw_rows))
+    fill()
+
+
+def fill() -> None:
+    """Writes the tables of docs/robots.md anew, from the rows beside it."""
+    text = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(page(text, rows.read(CSV)), encoding="utf-8")

@@ -25,7 +25,7 @@ STEPS = 10
 #: What counts as equal, relative above 1.
 EQUAL = 1e-9
 #: Physics steps an env step, for equality and for speed.
-_FRAME_SKIPS = {"equality": 2, "speed": 5}
+FRAME_SKIPS = {"equality": 2, "speed": 5}
 #: The sine of the control makes so much of a turn in a physics step (rad), and differs from
 #: actuator to actuator.
 _TURN = 0.35
@@ -63,7 +63,7 @@ class Generic(MujocoEnv):
     def outcome(self, before: Any, data: Any, action: jax.Array) -> Any:
         """Returns ``reward`` and ``is_over``."""
         limit = (STEPS + 0.5) * self.dt
-        if self.frame_skip == _FRAME_SKIPS["speed"]:
+        if self.frame_skip == FRAME_SKIPS["speed"]:
             limit = np.inf
         return reward(before.qpos, data, action, self.dt), is_over(data, limit), {}
 
@@ -128,7 +128,7 @@ def by_c(model: Any, start: Start, actions: np.ndarray, nudge: np.ndarray | floa
     data.qpos[:] = start.qpos
     data.qvel[:] = start.qvel + nudge
     mujoco.mj_forward(model, data)
-    frame_skip = _FRAME_SKIPS["equality"]
+    frame_skip = FRAME_SKIPS["equality"]
     dt = frame_skip * model.opt.timestep
     observations = [observation(data, np)]
     rewards, overs = [], []
@@ -208,7 +208,7 @@ def difference(shown: Played, expected: Played) -> tuple[float, str]:
 def equality(model: Any, name: str) -> dict[str, Any]:
     """Returns how far the engine of a name is from C MuJoCo in ten env steps."""
     start = start_of(model)
-    env = Generic(model, start, _FRAME_SKIPS["equality"])
+    env = Generic(model, start, FRAME_SKIPS["equality"])
     policy = policy_of(start, model.opt.timestep)
     default = choose("auto", env)  # without a policy nothing is compiled
     start_time = time.perf_counter()
@@ -279,7 +279,7 @@ def speed(model: Any) -> dict[str, Any]:
     pace = bare(2)
     horizon = int(np.clip(pace * _SECONDS / _NUM_EPISODES, 4, 500))
     start_time = time.perf_counter()
-    env = Generic(model, start, _FRAME_SKIPS["speed"])
+    env = Generic(model, start, FRAME_SKIPS["speed"])
     engine = choose("auto", env, policy, horizon)
     options: Any = {"num_episodes": _NUM_EPISODES, "horizon": horizon, "deterministic": True}
     play = jax.jit(
@@ -309,7 +309,7 @@ def speed(model: Any) -> dict[str, Any]:
 def _bare_batch(model: Any, start: Start) -> Callable[[int], float]:
     """Returns a function of a number of env steps: C MuJoCo's env steps a second on all cores."""
     batch = Batch(model, _NUM_EPISODES, nthread=num_cores())
-    frame_skip = _FRAME_SKIPS["speed"]
+    frame_skip = FRAME_SKIPS["speed"]
     turns = _TURN * frame_skip
     phases = _PHASE * np.arange(model.nu)
 

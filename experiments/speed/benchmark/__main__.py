@@ -115,6 +115,8 @@ class Settings:
     batches: tuple[int, ...] = ()
     """On a GPU, episodes of native and worlds of MuJoCo Warp, each number in turn; the task's own
     numbers if not given. With few of them the rows tell how long an env step takes."""
+    steps: int = 0
+    """On a GPU, env steps of native's episodes; the task's own number if 0."""
     shrink: int = 1
     """Divide episodes and worlds by this, to try the script; such rows are worth nothing."""
     worker: str = ""
@@ -181,7 +183,7 @@ def start(task: str, index: int, date: str, settings: Settings) -> subprocess.Po
     """Starts a task's process; on a CPU, held to two of the machine's threads."""
     command = [sys.executable, "-m", "experiments.speed.benchmark", settings.part]
     command += ["--tasks", task, "--worker", date]
-    for name in ("minutes", "csv", "commit", "repeats", "shrink"):
+    for name in ("minutes", "csv", "commit", "repeats", "steps", "shrink"):
         command.append(f"--{name}={getattr(settings, name)}")
     runs = [str(run) for run in settings.runs if task_of(run) == task]
     command += ["--runs", *runs] if runs else []
@@ -279,7 +281,8 @@ def on_gpu(task: str, settings: Settings) -> Callable[[], list[Candidate]]:
 
     sizes = GPU.get(task, OTHER)
     if settings.batches:
-        sizes = Sizes(settings.batches[-1], sizes.steps, warp=(), few=settings.batches[:-1])
+        steps = settings.steps or sizes.steps
+        sizes = Sizes(settings.batches[-1], steps, warp=(), few=settings.batches[:-1])
     native = []
     for run in (None, *settings.runs):
         try:

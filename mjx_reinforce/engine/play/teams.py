@@ -5,8 +5,9 @@ from typing import Any
 
 from mjx_reinforce.engine.base import PhysicsModel
 from mjx_reinforce.engine.gpu.team_kernel import FEW_WARPS, MANY_WARPS, Physics
+from mjx_reinforce.engine.play import c_mujoco
 
-#: Models of fewer degrees of freedom play faster by a thread an episode.
+#: Models of fewer degrees of freedom play faster by a thread an episode, if one can play them.
 _LEAST_DOFS = 14
 #: Models of so many degrees of freedom, or more, are played by 32 lanes, others by 16.
 _WIDE_DOFS = 16
@@ -19,7 +20,8 @@ def why_not(env: Any) -> str | None:
     model = physics_model(env)
     if model is None:
         return "it simulates no model of MuJoCo's"
-    if model.mj_model.nv < _LEAST_DOFS:
+    can_be_threads = c_mujoco.why_best(env) is None
+    if model.mj_model.nv < _LEAST_DOFS and can_be_threads:
         return f"a thread plays a model of fewer than {_LEAST_DOFS} degrees of freedom faster"
     from mjx_reinforce.engine.team import tables  # imports MuJoCo
 

@@ -180,6 +180,7 @@ def _weights(tables: Any, model: Any) -> Entries:
         else:
             bound_weights.append(model.tendon_invweight0[cable.tendon].reshape(1, 1))
     connected = np.array(tables.ints["connect_body"], int).reshape(-1, 2)
+    welded = connected[len(connected) - tables.constants["NWELD"] :]
     parts: Entries = {}
     if tables.constants["LIMITS"]:
         parts["dof_limit", "weight"] = dof_weight
@@ -188,6 +189,7 @@ def _weights(tables: Any, model: Any) -> Entries:
     return parts | {
         ("body_weight", ""): body_weight,
         ("connect_weight", ""): body_weight[connected].sum(1),
+        ("weld_weight", ""): model.body_invweight0[welded, 1].sum(1)[:, None],
         ("joined_weight", ""): ((joined >= 0)[:, :, None] * dof_weight[joined]).sum(1),
         ("bound", "weight"): jnp.concatenate(bound_weights),
     }

@@ -33,7 +33,7 @@ class Hulls(NamedTuple):
     vertex_faces: list[int]
     neighbors: list[int]
     faces: list[int]
-    face_normals: list[Sequence[float]]
+    face_normals: list[np.ndarray]
     face_corners: list[tuple[int, int]]
     corners: list[int]
     hulls: list[Sequence[int]]
@@ -49,7 +49,9 @@ def of_geoms(model: Any, geoms: Iterable[int]) -> Hulls:
         vertex_count = model.mesh_vertnum[mesh]
         places = model.mesh_vert[model.mesh_vertadr[mesh] :][:vertex_count]
         graph = model.mesh_graph[model.mesh_graphadr[mesh] :]
-        key = places.tobytes() + graph[: 2 + 3 * graph[0] + 3 * graph[1]].tobytes()
+        # Up to the end of the neighbors; triangles follow.
+        graph = graph[: 2 + 3 * graph[0] + 3 * graph[1]]
+        key = places.tobytes() + graph.tobytes()
         if key not in known:
             known[key] = len(hulls.hulls)
             _add(hulls, model, mesh, places, graph)
@@ -68,11 +70,12 @@ def _add(hulls: Hulls, model: Any, mesh: int, places: np.ndarray, graph: np.ndar
       graph: MuJoCo's mesh_graph from where that of the mesh begins: numbers of vertices and
         triangles, where the neighbors of a vertex begin, the mesh's number of a vertex, neighbors.
     """
-    starts, mesh_ids, neighbors = np.split(graph[2:], [graph[0], 2 * graph[0]])
-    rank = {int(x): n for n, x in enumerate(mesh_ids)}
+    parts = np.split(graph[2:], [graph[0], 2 * graph[0]])
+    starts, mesh_ids, neighbors = (x.tolist() for x in parts)
+    rank = {x: n for n, x in enumerate(mesh_ids)}
     # As C looks at all vertices of a small mesh, in their order, these are not the hull's alone.
     is_searched = len(places) < _MIN_CLIMBED
-    vertices = range(len(places)) if is_searched else mesh_ids.tolist()
+    vertices = range(len(places)) if is_searched else mesh_ids
     first = len(hulls.places)
     first_face = len(hulls.face_corners)
     number_of = {x: first + n for n, x in enumerate(vertices)}
@@ -80,8 +83,9 @@ def _add(hulls: Hulls, model: Any, mesh: int, places: np.ndarray, graph: np.ndar
         hulls.places.append(places[vertex])
         hulls.vertex_neighbors.append(len(hulls.neighbors))
         if vertex in rank:
-            row = neighbors[starts[rank[vertex]] :].tolist()
-            hulls.neighbors.extend(number_of[int(mesh_ids[x])] for x in row[: row.index(_END)])
+            start = starts[rank[vertex]]
+            row = neighbors[start : neighbors.index(_END, start)]
+            hulls.neighbors.extend(number_of[mesh_ids[x]] for x in row)
         hulls.neighbors.append(_END)
         hulls.vertex_faces.append(len(hulls.faces))
         entry = model.mesh_vertadr[mesh] + vertex
@@ -92,7 +96,7 @@ def _add(hulls: Hulls, model: Any, mesh: int, places: np.ndarray, graph: np.ndar
         row = model.mesh_polyvert[model.mesh_polyvertadr[face] :][: model.mesh_polyvertnum[face]]
         hulls.face_corners.append((len(hulls.corners), len(row)))
         hulls.corners.extend(number_of[int(x)] for x in row)
-    seeds = [number_of[int(mesh_ids[x])] for x in model.mesh_extrema[mesh]]
+    seeds = [number_of[mesh_ids[x]] for x in model.mesh_extrema[mesh]]
     hulls.hulls.append((first, len(places) if is_searched else 0, *seeds))
 
 
@@ -113,7 +117,7 @@ def text(hulls: Hulls) -> list[str]:
         )
     ]
     faces = [
-        f"{{{{{','.join(f'real({float(x)!r})' for x in normal)}}},{start},{count}}}"
+        f"{{{{{','.join(map(repr, normal.tolist()))}}},{start},{count}}}"
         for normal, (start, count) in zip(hulls.face_normals, hulls.face_corners, strict=True)
     ]
     rows = [

@@ -25,8 +25,9 @@ MAX_DOFS = 64
 #: Bits of a geom's number in a packed item, two of which and a part's number fit into an int.
 GEOM_BITS = 12
 _MAX_GEOMS = 2**GEOM_BITS
-#: What a team has memory for.
-_MAX_CONTACTS = 16384
+MAX_ITEMS = 4096
+#: Contacts that a team has memory for, of some 250 bytes each.
+_MAX_CONTACTS = 4 * MAX_ITEMS
 #: How many contacts two geoms of these types may have, each of which is a part of the pair.
 NUM_PARTS = {
     (PLANE, SPHERE): 1,
@@ -138,8 +139,8 @@ def _lacking_parts(model: Any) -> Iterable[tuple[str, Any]]:
     yield "tendons with a range of actuators' forces", np.any(model.tendon_actfrclimited)
     yield "joints that yield", np.any(model.jnt_springyield)
     active = model.eq_type[np.asarray(model.eq_active0, bool)]
-    equalities = (_C.mjtEq.mjEQ_CONNECT, _C.mjtEq.mjEQ_JOINT)
-    yield "equalities other than connect and joint", not np.isin(active, equalities).all()
+    equalities = (_C.mjtEq.mjEQ_CONNECT, _C.mjtEq.mjEQ_WELD, _C.mjtEq.mjEQ_JOINT)
+    yield "equalities other than connect, weld and joint", not np.isin(active, equalities).all()
 
 
 def _lacking_actuators(model: Any) -> Iterable[tuple[str, Any]]:
@@ -191,7 +192,8 @@ def _lacking_contacts(model: Any) -> Iterable[tuple[str, Any]]:
     yield "adhesion or moving surfaces", any(np.any(x) for x in adhesions)
     num_contacts = 0
     has_convex = False
-    for pair in meeting(model):
+    pairs = meeting(model)
+    for pair in pairs:
         kinds = geom_kinds(model, pair)
         flat_name, round_name = map(_geom_name, kinds)
         is_convex = kinds in CONVEX_CONTACTS
@@ -199,10 +201,16 @@ def _lacking_contacts(model: Any) -> Iterable[tuple[str, Any]]:
         # A kind that is lacking does not get here: ``why`` stops at the first one.
         num_contacts += CONVEX_CONTACTS[kinds] if is_convex else NUM_PARTS[kinds]
         has_convex |= is_convex
+    yield f"more than {MAX_ITEMS} pairs of geoms that may meet", len(pairs) > MAX_ITEMS
     yield f"more than {_MAX_CONTACTS} possible contacts", num_contacts > _MAX_CONTACTS
     is_long = model.opt.ccd_iterations > _MAX_CONVEX_STEPS
     yield f"more than {_MAX_CONVEX_STEPS} ccd_iterations", has_convex and is_long
     yield "the flag nativeccd disabled", has_convex and flags.is_off(model, "nativeccd")
+
+
+def num_parts(model: Any) -> int:
+    """Returns how many parts the pairs of geoms that may meet have, that can be told apart."""
+    return sum(NUM_PARTS.get(geom_kinds(model, pair), 1) for pair in meeting(model))
 
 
 def _geom_name(kind: int) -> str:

@@ -642,28 +642,45 @@ class _Tables:
         """Makes the tables of equality constraints."""
         model = self.model
         eq_kinds = np.where(model.eq_active0, model.eq_type, -1)
+        weld_eqs = np.flatnonzero(eq_kinds == _C.mjtEq.mjEQ_WELD)
         connect_eqs = np.flatnonzero(eq_kinds == _C.mjtEq.mjEQ_CONNECT)
+        connect_eqs = np.concatenate([connect_eqs, weld_eqs])
         joint_eqs = np.flatnonzero(eq_kinds == _C.mjtEq.mjEQ_JOINT)
         self.constants["NCONNECT"] = len(connect_eqs)
-        self.constants["NE"] = 3 * len(connect_eqs) + len(joint_eqs)
+        self.constants["NWELD"] = len(weld_eqs)
+        self.constants["NE"] = 3 * len(connect_eqs) + 3 * len(weld_eqs) + len(joint_eqs)
         links = []
+        turns = []
         places = []
         bodies = []
         for equality in connect_eqs:
             ends = (model.eq_obj1id[equality], model.eq_obj2id[equality])
             anchors = model.eq_data[equality, :6].reshape(2, 3)
+            # A weld has them the other way around, and a relative pose.
+            is_weld = model.eq_type[equality] == _C.mjtEq.mjEQ_WELD
+            quats = np.array([model.eq_data[equality, 6:10], [1, 0, 0, 0]])
+            if is_weld:
+                anchors = anchors[::-1]
             # Between sites there are no anchors in eq_data: the sites are.
             if model.eq_objtype[equality] == _C.mjtObj.mjOBJ_SITE:
                 anchors = model.site_pos[list(ends)]
+                quats = model.site_quat[list(ends)]
                 ends = model.site_bodyid[list(ends)]
             frames = [self.frames[body] for body in ends]
             bodies.append([int(body) for body in ends])
             links.append([self._link_number(frame.link) for frame in frames])
             places.append([frame.place(x) for frame, x in zip(frames, anchors, strict=True)])
+            if is_weld:
+                ends_quats = [times(x.quat, quat) for x, quat in zip(frames, quats, strict=True)]
+                turns.append([rotation(quat) for quat in ends_quats])
         self.ints["connect_link"] = links
         self.ints["connect_body"] = bodies
         self.reals["connect_at"] = places
         self.reals["connect_weight"] = [model.body_invweight0[x, 0].sum() for x in bodies]
+        weld_bodies = bodies[len(bodies) - len(weld_eqs) :]
+        self.reals["weld_turn"] = turns
+        self.reals["weld_scale"] = model.eq_data[weld_eqs, 10]
+        self.reals["weld_weight"] = [model.body_invweight0[x, 1].sum() for x in weld_bodies]
         self.ints["connect_soft"] = self._equality_softs(connect_eqs)
         # A joint alone is held at a value: its second is -1.
         joints = np.stack([model.eq_obj1id[joint_eqs], model.eq_obj2id[joint_eqs]], 1)
@@ -710,6 +727,10 @@ class _Tables:
         has_friction = "geom_friction" in self.random
         kind_numbers: dict[tuple[ContactKind, int], int] = {}
         kind_pairs = 0
+        num_contacts = 0
+        # Where parts are many, their table leaves little shared memory, and going through it takes
+        # long.
+        is_whole = supported.num_parts(model) > supported.MAX_ITEMS
         items = []
         item_kinds = []
         weights = []
@@ -726,7 +747,9 @@ class _Tables:
             flat, other = (_GEOM_KINDS[x] for x in geom_types)
             kind_pairs |= 1 << (other * (other + 1) // 2 + flat)
             # The convex collider finds all contacts of a pair at once.
-            for part in range(supported.NUM_PARTS.get(geom_types, 1)):
+            num_parts = supported.NUM_PARTS.get(geom_types, 1)
+            num_contacts += supported.CONVEX_CONTACTS.get(geom_types, num_parts)
+            for part in [num_parts - 1] if is_whole else range(num_parts):
                 items.append(records.packed_item(geom_ids[pair.geom1], geom_ids[pair.geom2], part))
                 item_kinds.append(number)
                 weights.append(weight)
@@ -742,27 +765,19 @@ class _Tables:
         self.ints["kind_mix"] = [mix for _, mix in kind_numbers] if has_friction else []
         self.geoms = np.array(geoms, int)
         kinds = [kind for kind, _ in kind_numbers]
-        self.ints["kind_dim"] = [x.dim for x in kinds]
-        self.ints["kind_soft"] = [self._number(x.softness) for x in kinds]
-        self.reals["kind_margin"] = [x.margin for x in kinds]
-        self.reals["kind_friction"] = [x.friction for x in kinds]
-        self.reals["kind_mu"] = []
-        self.ints["kind_soft_friction"] = []
-        if self._is_elliptic():
-            # C's regularized friction of the cone.
-            root = np.sqrt(max(model.opt.impratio, MIN_VALUE))
-            self.reals["kind_mu"] = [x.friction[0] / root for x in kinds]
-            self.ints["kind_soft_friction"] = [self._number(x.friction_softness) for x in kinds]
+        self._kinds(kinds)
         self.constants["KIND_PAIRS"] = kind_pairs
         self.constants["NI"] = len(items)
-        self.constants["NC"] = len(items) + self._convex([pair for pair, _ in pairs], kinds)
-        self.constants["NEAR"] = max(1, min(num_near, self.constants["NC"]))
+        self.constants["WHOLE_PAIRS"] = int(is_whole)
+        self.constants["NC"] = num_contacts
+        self.constants["NEAR"] = max(1, min(num_near, num_contacts))
+        self._convex([pair for pair, _ in pairs], kinds)
         self.constants["CD"] = max((x.dim for x in kinds), default=1)
         self.constants["NG"] = max(len(geoms), 1)
         self._geoms(self.geoms)
 
-    def _convex(self, pairs: Iterable[supported.GeomPair], kinds: Iterable[ContactKind]) -> int:
-        """Makes the tables of the convex collider; returns how many contacts exceed one a pair."""
+    def _convex(self, pairs: Iterable[supported.GeomPair], kinds: Iterable[ContactKind]) -> None:
+        """Makes the tables of the convex collider."""
         model = self.model
         all_types = [supported.geom_kinds(model, x) for x in pairs]
         convex_types = [x for x in all_types if x in supported.CONVEX_CONTACTS]
@@ -774,7 +789,20 @@ class _Tables:
         self.constants["CONVEX_STEPS"] = model.opt.ccd_iterations
         self.real_constants["CONVEX_TOLERANCE"] = float(model.opt.ccd_tolerance)
         self.reals["kind_gap"] = [x.gap for x in kinds] if convex_types else []
-        return sum(num_contacts) - len(num_contacts)
+
+    def _kinds(self, kinds: list[ContactKind]) -> None:
+        """Makes the tables of what contacts of several pairs have in common."""
+        self.ints["kind_dim"] = [x.dim for x in kinds]
+        self.ints["kind_soft"] = [self._number(x.softness) for x in kinds]
+        self.reals["kind_margin"] = [x.margin for x in kinds]
+        self.reals["kind_friction"] = [x.friction for x in kinds]
+        self.reals["kind_mu"] = []
+        self.ints["kind_soft_friction"] = []
+        if self._is_elliptic():
+            # C's regularized friction of the cone.
+            root = np.sqrt(max(self.model.opt.impratio, MIN_VALUE))
+            self.reals["kind_mu"] = [x.friction[0] / root for x in kinds]
+            self.ints["kind_soft_friction"] = [self._number(x.friction_softness) for x in kinds]
 
     def _geoms(self, geoms: np.ndarray) -> None:
         """Makes the tables of the geoms that may meet."""

@@ -62,6 +62,7 @@ _WALKER = """
   <equality>
     <joint joint1="slide" joint2="knee" polycoef="0 .1"/>
     <connect body1="arm" body2="base" anchor=".1 .1 .1" solref=".1 1"/>
+    <weld body1="arm" body2="base" relpose=".1 .1 .1 1 .1 0 0" solref=".2 1"/>
   </equality>
   <actuator>
     <position joint="hip" kp="5" kv=".2" gear="1.5"/>

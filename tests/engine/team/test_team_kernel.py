@@ -330,3 +330,12 @@ def test_teams_play_what_c_mujoco_plays_on_a_cpu(teams, flags):
     for field in ("observation", "action", "reward"):
         pair = (getattr(x, field) for x in trajectories)
         np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=field)
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_teams_play_small_models_that_no_thread_plays(cone):
+    xml = LEG.replace("<mujoco>", f'<mujoco><option cone="{cone}"/>')
+    model = mujoco.MjModel.from_xml_string(xml)
+    env = Leg(xml_file=model, frame_skip=2, max_episode_steps=9, reward_threshold=None)
+    reason = team.why_not(env)
+    assert reason is None if cone == "elliptic" else "a thread plays" in str(reason)

@@ -31,6 +31,7 @@ _MODELS = tomllib.loads((Path(__file__).parent / "models.toml").read_text("utf-8
 _QUICK = ("limits", "condim 6 and 4", "elliptic cones, condim 1 and 3", "boxes on boxes", "3 steps")
 _OF_MOCAP = [x for x in _MODELS["features"] if "mocap" in x]
 _MANY = '<geom size=".1"/>'
+_BOX = '<geom type="box" size=".1 .1 .1"/>'
 _TWO = """
 <mujoco>
   <option gravity="0 0 0"/>
@@ -49,8 +50,9 @@ _PAIRS = [
 _REFUSED = {
     **_MODELS["refused"],
     "4096 geoms or more": {"rest": f"<worldbody>{_MANY * 4096}</worldbody>"},
+    "more than 4096 pairs": {"bodies": [f'size=".1"/>{_MANY * 64}<geom size=".1"'] * 2},
     "more than 16384 possible contacts": {
-        "bodies": [f'size=".1"/>{_MANY * 128}<geom size=".1"'] * 2
+        "bodies": [f'type="box" size=".1 .1 .1"/>{_BOX * 46}<geom size=".1"'] * 2
     },
 }
 
@@ -202,6 +204,7 @@ def test_a_search_that_stops_early_ends_where_c_ends(limits, tmp_path):
         "spatial tendons",
         "limits and friction loss of tendons",
         "a tendon between two trees, implicitfast",
+        "weld of two bodies",
         *_OF_MOCAP,
     ],
 )
@@ -224,6 +227,20 @@ def test_lanes_share_friction_without_slip(feature, tmp_path):
 def test_lanes_share_islands(limits, tmp_path):
     m = _model(**_MODELS["early"][limits])
     assert _largest_error(m, tmp_path, skip=3, starts=1, lanes=8) < 1e-9
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("lanes", [1, 8])
+@pytest.mark.parametrize(
+    "feature", ["boxes on boxes", "no slip, elliptic cones of bodies that meet"]
+)
+def test_pairs_whose_parts_are_many_are_whole(feature, lanes, tmp_path, monkeypatch):
+    (name,) = [x for x in _MODELS["features"] if x.startswith(feature)]
+    m = _model(**_MODELS["features"][name])
+    monkeypatch.setattr(tables.supported, "MAX_ITEMS", 30)
+    assert "WHOLE_PAIRS = 1" in tables.physics_text(m)
+    assert _largest_error(_exact(m), tmp_path, skip=3, starts=1, lanes=lanes) < 1e-9
 
 
 @needs_compiler

@@ -2,9 +2,9 @@
 // them are looked at closely.
 #pragma once
 
-// The contact of an item, if its distance is below the margin.
-DEV Touch touch_of(const Model& M, const State& s, int item, real margin) {
-  const int a = M.item[item].first(), b = M.item[item].second(), part = M.item[item].part();
+// The contact of a part of an item, if its distance is below the margin.
+DEV Touch touch_of(const Model& M, const State& s, int item, int part, real margin) {
+  const int a = M.item[item].first(), b = M.item[item].second();
   Touch c;
   for (int k = 0; k < 3; k++) c.tangent[k] = 0;
   const int below = M.geom_kind[a], above = M.geom_kind[b];
@@ -96,22 +96,35 @@ DEV void collide(const Team& t, const Model& M, State& s) {
         if (CONVEX_CONTACTS && meet_as_convex(M, M.item[queued_item])) {
           contacts = touch_convex(M, s, queued_item, margin, touch);
           touches = contacts > 0;
+        } else if (WHOLE_PAIRS) {
+          contacts = 0;
+          const int last_part = M.item[queued_item].part();
+          LOOP for (int part = 0; part <= last_part && contacts < MOST_TOUCHES; part++) {
+            touch[contacts] = touch_of(M, s, queued_item, part, margin);
+            contacts += touch[contacts].distance < margin;
+          }
+          touches = contacts > 0;
         } else {
-          touch[0] = touch_of(M, s, queued_item, margin);
+          touch[0] = touch_of(M, s, queued_item, M.item[queued_item].part(), margin);
           touches = touch[0].distance < margin;
         }
       }
+      // In the order of the items, whatever the number of lanes: no_slip goes through them in it.
+      unsigned touching_lanes[MOST_TOUCHES];
+      UNROLL for (int n = 0; n < MOST_TOUCHES; n++)
+        touching_lanes[n] = t.ballot(n > 0 ? touches && n < contacts : touches);
       LOOP for (int n = 0; n < MOST_TOUCHES; n++) {
         if (n > 0) touches &= n < contacts;
-        const unsigned touching_lanes = t.ballot(touches);
         if (touches) {
-          const int at = num_contacts + count(touching_lanes & ((1u << lane) - 1));
+          int at = num_contacts + n;
+          UNROLL for (int k = 0; k < MOST_TOUCHES; k++)
+            at += count(touching_lanes[k] & ((1u << lane) - 1));
           const Contact contact = contact_of(M, s, queued_item, touch[n]);
           // Not by contact_at: stores through a reference to either would be to no known memory.
           if (!FAR || at < NEAR) s.contacts[at] = contact; else s.far[at - NEAR] = contact;
         }
-        num_contacts += count(touching_lanes);
       }
+      UNROLL for (int n = 0; n < MOST_TOUCHES; n++) num_contacts += count(touching_lanes[n]);
       const int next = s.queue[W + lane];
       t.sync();
       waiting -= W;

@@ -1,7 +1,8 @@
 // Contacts of two convex geoms (mjc_Convex of MuJoCo 4.0).
 #pragma once
 
-constexpr int MOST_TOUCHES = CONVEX_CONTACTS > 1 ? CONVEX_CONTACTS : 1;
+// Of one item. A box and a box have at most 8, which C finds in as many parts.
+constexpr int MOST_TOUCHES = WHOLE_PAIRS ? 8 : CONVEX_CONTACTS > 1 ? CONVEX_CONTACTS : 1;
 
 // Whether two geoms meet as convex ones; of others, C has closed forms.
 DEV bool meet_as_convex(const Model& M, Item item) {

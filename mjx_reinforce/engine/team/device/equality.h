@@ -1,6 +1,112 @@
-// Rows of equality constraints: points of two bodies that are one (connect), and joints that move
-// together (MuJoCo's mj_instantiateEquality).
+// Rows of equality constraints: points of two bodies that are one (connect), bodies that do not
+// turn against each other either (weld: the last of these), and joints that move together (MuJoCo's
+// mj_instantiateEquality).
 #pragma once
+
+// The quaternion of a weld: how the first of two frames is turned in the second; either sign.
+struct Weld {
+  Pose first, second;
+  real q[4];
+  // What the quaternion's axis gains by a relative angular velocity, in the world's axes.
+  DEV void gain(real* out, const real* velocity) const {
+    real in_second[3], across[3];
+    second.turn_back(in_second, velocity);
+    cross(across, in_second, q + 1);
+    for (int k = 0; k < 3; k++) out[k] = (q[0] * in_second[k] + across[k]) / 2;
+  }
+  // The torque of what pushes the axis.
+  DEV void torque(real* out, const real* force) const {
+    real sum[3];
+    cross(sum, q + 1, force);
+    for (int k = 0; k < 3; k++) sum[k] = (sum[k] + q[0] * force[k]) / 2;
+    second.turn(out, sum);
+  }
+};
+DEV Weld weld_of(const Model& M, const State& s, int n) {
+  const int connect = NCONNECT - NWELD + n;
+  Pose end[2];
+  real turn[3][3];  // of the first frame in the second
+  for (int side = 0; side < 2; side++)
+    for (int j = 0; j < 3; j++) {
+      const real* own = M.weld_turn + 18 * n + 9 * side;
+      const real axis[3] = {own[j], own[3 + j], own[6 + j]};
+      real seen[3];
+      s.pose[M.connect_link[2 * connect + side]].turn(seen, axis);
+      for (int k = 0; k < 3; k++) end[side].row[k].x[j] = seen[k];
+    }
+  for (int j = 0; j < 3; j++) {
+    const real axis[3] = {end[0].row[0].x[j], end[0].row[1].x[j], end[0].row[2].x[j]};
+    real seen[3];
+    end[1].turn_back(seen, axis);
+    for (int k = 0; k < 3; k++) turn[k][j] = seen[k];
+  }
+  // By its largest entry, so that nothing is lost where another one is near zero.
+  const real* d[3] = {turn[0], turn[1], turn[2]};
+  const real trace = d[0][0] + d[1][1] + d[2][2];
+  int most = 0;
+  for (int k = 0; k < 3; k++)
+    if (d[k][k] > (most ? d[most - 1][most - 1] : trace)) most = k + 1;
+  Weld weld = {end[0], end[1], {}};
+  real* q = weld.q;
+  const int i = most ? most - 1 : 0, j = (i + 1) % 3, k = (i + 2) % 3;
+  if (most == 0) {
+    q[0] = 1 + trace;
+    for (int m = 0; m < 3; m++)
+      q[1 + m] = d[(m + 2) % 3][(m + 1) % 3] - d[(m + 1) % 3][(m + 2) % 3];
+  } else {
+    q[0] = d[k][j] - d[j][k];
+    q[1 + i] = 1 + 2 * d[i][i] - trace;
+    q[1 + j] = d[i][j] + d[j][i];
+    q[1 + k] = d[i][k] + d[k][i];
+  }
+  to_unit(q);
+  return weld;
+}
+
+// Rows by which the frames of a weld do not turn against each other.
+DEV void weld_rows(const Team& t, const Model& M, State& s, int n, const Weld& weld,
+                   real strength) {
+  const int lane = t.lane, e = 3 * (NCONNECT + n), connect = NCONNECT - NWELD + n;
+  const int link[2] = {M.connect_link[2 * connect], M.connect_link[2 * connect + 1]};
+  const Softness& soft = M.soft[M.connect_soft[connect]];
+  const real scale = M.weld_scale[n];
+  EACH(i, SIDE) {
+    const bool first = i < NV && M.link_dofs[link[0]] >> i & 1;
+    const bool second = i < NV && M.link_dofs[link[1]] >> i & 1;
+    real moves[3] = {}, by[3];
+    for (int k = 0; k < 3 && first != second; k++)
+      moves[k] = first ? s.cdof[i][0].x[k] : -s.cdof[i][0].x[k];
+    weld.gain(by, moves);
+    for (int k = 0; k < 3; k++) s.general[e + k][i / 4].x[i % 4] = scale * by[k];
+  }
+  if (lane > 0) return;
+  real moves[3] = {}, speed[2][3] = {}, apart[3], seen[2][3], by[3];
+  real gain[3], in_second[3], both[3], across[3];
+  for (int side = 0; side < 2; side++) {
+    const int l = link[side];
+    if (l >= NL) continue;
+    const real* a = &s.subtree[l][2].x[0] + 2;  // the acceleration that qvel brings
+    for (int k = 0; k < 3; k++) {
+      speed[side][k] = s.velocity[l][k];
+      moves[k] += (side ? -1 : 1) * (a[k] + s.motion[l][k] + soft.damping * speed[side][k]);
+    }
+  }
+  weld.gain(by, moves);
+  // How the rows change as the frames turn (mj_Jdotv).
+  for (int k = 0; k < 3; k++) apart[k] = speed[0][k] - speed[1][k];
+  weld.gain(gain, apart);
+  weld.second.turn_back(in_second, apart);
+  weld.first.turn_back(seen[0], speed[0]);
+  weld.second.turn_back(seen[1], speed[1]);
+  for (int k = 0; k < 3; k++) both[k] = seen[0][k] + seen[1][k];
+  cross(across, gain, both);
+  for (int k = 0; k < 3; k++)
+    by[k] += across[k] / 2 - dot(in_second, weld.q + 1) * (seen[0][k] - seen[1][k]) / 4;
+  for (int k = 0; k < 3; k++) {
+    s.general_constraint_mass[e + k] = constraint_mass(strength, M.weld_weight[n]);
+    s.general_residual[e + k] = scale * (by[k] + soft.stiffness * strength * weld.q[1 + k]);
+  }
+}
 
 DEV void connect_rows(const Team& t, const Model& M, State& s, int n) {
   const int lane = t.lane;
@@ -23,6 +129,13 @@ DEV void connect_rows(const Team& t, const Model& M, State& s, int n) {
     }
     for (int k = 0; k < 3; k++) s.general[3 * n + k][i / 4].x[i % 4] = sum[k];
   }
+  real square = dot(apart, apart);
+  if (NWELD && n >= NCONNECT - NWELD) {
+    const int w = n - (NCONNECT - NWELD);
+    const Weld weld = weld_of(M, s, w);
+    square += M.weld_scale[w] * M.weld_scale[w] * dot(weld.q + 1, weld.q + 1);
+    weld_rows(t, M, s, w, weld, impedance(soft, root(square)));
+  }
   EACH(k, 3) {
     real residual = 0;
     for (int side = 0; side < 2; side++) {
@@ -39,7 +152,7 @@ DEV void connect_rows(const Team& t, const Model& M, State& s, int n) {
       const real point = by_qvel[k] + a[3 + k] + turned[k] + by_x[k] + x[3 + k];
       residual += (side ? -1 : 1) * (point + soft.damping * speed[k]);
     }
-    const real strength = impedance(soft, root(dot(apart, apart)));
+    const real strength = impedance(soft, root(square));
     s.general_constraint_mass[3 * n + k] = constraint_mass(strength, M.connect_weight[n]);
     s.general_residual[3 * n + k] = residual + soft.stiffness * strength * apart[k];
   }
@@ -47,8 +160,9 @@ DEV void connect_rows(const Team& t, const Model& M, State& s, int n) {
 
 DEV void joint_rows(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
-  EACH(n, NE - NLIMITED - NLOSS - 3 * NCONNECT) {
-    const int e = 3 * NCONNECT + n, first = M.joined_dof[2 * n], second = M.joined_dof[2 * n + 1];
+  constexpr int BEFORE = 3 * (NCONNECT + NWELD);
+  EACH(n, NE - NLIMITED - NLOSS - BEFORE) {
+    const int e = BEFORE + n, first = M.joined_dof[2 * n], second = M.joined_dof[2 * n + 1];
     const real* p = M.joined_poly + 5 * n;
     const Softness& soft = M.soft[M.joined_soft[n]];
     for (int q = 0; q < QUADS; q++) s.general[e][q] = {0, 0, 0, 0};

@@ -81,7 +81,8 @@ DEV void minimize_in_ellipsoid(int n, const real (*a)[CD], const real* b, const 
     if (-over / slope < SMALL) break;
     multiplier -= over / slope;
   }
-  const real scale = multiplier == 0 ? real(1) : reach / root(square > 1e-15 ? square : real(1e-15));
+  const real scale =
+      multiplier == 0 ? real(1) : reach / root(square > real(1e-15) ? square : real(1e-15));
   for (int i = 0; i < n; i++) x[i] *= scale * friction[i];
 }
 

@@ -3,9 +3,9 @@
 #pragma once
 
 // A part of a pair of geoms that makes one contact at most: an end of a capsule, a corner of a box.
-// The geoms are numbered among those that may meet.
+// The geoms are numbered among those that may meet. With WHOLE_PAIRS an item is all of a pair.
 struct Item {
-  int packed;  // 12 bits of a geom, 12 bits of the other one, the part's number
+  int packed;  // 12 bits of a geom, 12 bits of the other one, the part's number or the last one's
   DEV constexpr int first() const { return packed & 0xfff; }
   DEV constexpr int second() const { return packed >> 12 & 0xfff; }
   DEV constexpr int part() const { return packed >> 24 & 7; }

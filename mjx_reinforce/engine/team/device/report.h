@@ -13,7 +13,7 @@ DEV void add_external(State& s, int b, real sign, const real* force, const real*
   }
 }
 
-// cfrc_ext of contacts, connect constraints and spatial tendons (MuJoCo's mj_rnePostConstraint). A
+// cfrc_ext of contacts, connects, welds and spatial tendons (MuJoCo's mj_rnePostConstraint). A
 // lane has a body.
 DEV void external_forces(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
@@ -36,16 +36,24 @@ DEV void external_forces(const Team& t, const Model& M, State& s) {
     }
   });
   for (int n = 0; n < NCONNECT; n++) {
-    real force[3];
-    const real none[3] = {};
-    for (int k = 0; k < 3; k++)
-      force[k] = -s.general_constraint_mass[3 * n + k] * s.general_residual[3 * n + k];
+    const auto push_of = [&](int e) {
+      return -s.general_constraint_mass[e] * s.general_residual[e];
+    };
+    const int weld = n - (NCONNECT - NWELD);
+    real force[3], torque[3] = {};
+    for (int k = 0; k < 3; k++) force[k] = push_of(3 * n + k);
+    if (NWELD && weld >= 0) {
+      real turn[3];
+      for (int k = 0; k < 3; k++) turn[k] = push_of(3 * (NCONNECT + weld) + k);
+      weld_of(M, s, weld).torque(torque, turn);
+      for (int k = 0; k < 3; k++) torque[k] *= M.weld_scale[weld];
+    }
     for (int side = 0; side < 2; side++) {
       const int b = M.connect_body[2 * n + side];
       real at[3];
       s.pose[M.connect_link[2 * n + side]].place(at, M.connect_at + 6 * n + 3 * side);
       for (int k = 0; k < 3; k++) at[k] -= s.pose[0].origin(k);
-      if (b > 0 && b % W == lane) add_external(s, b, side ? -1 : 1, force, none, at);
+      if (b > 0 && b % W == lane) add_external(s, b, side ? -1 : 1, force, torque, at);
     }
   }
   for (int n = 0; n < NCABLE && SEGMENTS; n++) {
