@@ -198,7 +198,7 @@ DEV void widen(const real (*polygon)[3], int corners, int* n) {
     const int before = at[i];
     at[i] = next(before);
     const real x = area(at);
-    if (x <= most * (1 + SAME_AREA)) {
+    if (!(x > most * (1 + SAME_AREA))) {  // also where it is no number
       at[i] = before;
       return false;
     }
