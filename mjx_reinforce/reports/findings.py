@@ -1,6 +1,5 @@
 """The figures of a report: what an experiment's numbers say, best configuration first."""
 
-import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -81,7 +80,7 @@ class Result(NamedTuple):
 class Findings(NamedTuple):
     """All figures of a report.
 
-    results: best first, see ``_rank``
+    results: best first, see ``_rank``; behind all others what a sweep excluded while it went on
     order: of each result, the place of its configuration in the experiment
     grid: [K] env steps
     comparisons: of all pairs of the best results, which are numbered by their places here
@@ -122,7 +121,10 @@ def compute_findings(experiment: Experiment) -> Findings:
         for part in parts
     ]
     # From here on a configuration is known by its rank; ``order`` leads back to the sources.
-    order = sorted(range(len(results)), key=lambda i: _rank(results[i]))
+    contenders = range(len(results))
+    if experiment.decision is not None:
+        contenders = experiment.decision.contenders
+    order = sorted(range(len(results)), key=lambda i: (i not in contenders, *_rank(results[i])))
     ranked_results = [results[i] for i in order]
     return Findings(
         experiment,
@@ -219,15 +221,12 @@ def _rank(result: Result) -> tuple[float, ...]:
 
 
 def _compare_pairs(results: Sequence[Result]) -> list[Comparison]:
-    """Compares the scores of all pairs, on the seeds that all of them have."""
+    """Compares the scores of all pairs, each on the seeds that both have."""
     seeds = [result.configuration.seed for result in results]
-    shared_seeds = functools.reduce(np.intersect1d, seeds)
-    if len(results) < 2 or len(shared_seeds) < 2:
+    pairs = itertools.combinations(seeds, 2)
+    if min((np.intersect1d(*pair).size for pair in pairs), default=0) < 2:
         return []
-    # Seeds ascend in every source, so that the shared ones stand in one order.
-    return compare_all(
-        [result.scores[np.isin(result.configuration.seed, shared_seeds)] for result in results]
-    )
+    return compare_all([result.scores for result in results], seeds)
 
 
 def by_speed(results: Sequence[Result]) -> list[int]:

@@ -22,6 +22,7 @@ from mjx_reinforce.reports.experiment import (
     setting_in_words,
     settings_in_words,
 )
+from mjx_reinforce.statistics.sequential import Verdict
 
 #: What config.json says besides the settings.
 PROVENANCE = (
@@ -41,7 +42,16 @@ PROVENANCE = (
 )
 _TIMINGS = ("compile_seconds", "run_seconds", "statistics_seconds")
 #: What sweep.json says of the sweep itself; all else is its provenance.
-_SWEEP_KEYS = ("status", "env", "threshold", "settings", "configurations", *_TIMINGS)
+_SWEEP_KEYS = (
+    "status",
+    "env",
+    "threshold",
+    "settings",
+    "configurations",
+    "until_decided",
+    "decision",
+    *_TIMINGS,
+)
 #: The columns and arrays that are read, and their types.
 _METRICS = {"seed": np.int64, "env_steps": np.int64, "eval_return": np.float64}
 #: How the columns of the reward's terms begin.
@@ -106,6 +116,7 @@ def read_experiment(paths: Sequence[Path]) -> Experiment:
         directories=[source.directory for source in joined for _ in source.configurations],
         unfinished=[source.directory for source in sources if source.status != "finished"],
         disagree=disagree,
+        decision=sources[0].decision if len(sources) == 1 else None,
     )
 
 
@@ -326,8 +337,24 @@ def _read_sweep(directory: Path, content: dict[str, Any]) -> Source:
             configurations=parts,
             settings=content.get("settings", {}),
             provenance={name: x for name, x in content.items() if name not in _SWEEP_KEYS},
+            decision=_read_decision(content.get("decision"), len(swept)),
             **_outcome(content),
         )
+
+
+def _read_decision(record: Mapping[str, Any] | None, num_configurations: int) -> Verdict | None:
+    """Returns the decision of a sweep; None where it makes none.
+
+    Raises:
+      ValueError: it is about other configurations.
+    """
+    if record is None:
+        return None
+    verdict = Verdict(**record)
+    places = range(num_configurations)
+    if len(verdict.num_seeds) != num_configurations or not set(verdict.contenders) <= set(places):
+        raise ValueError(f"decision is not about {counted(num_configurations, 'configuration')}")
+    return verdict
 
 
 def _outcome(content: Mapping[str, Any]) -> dict[str, Any]:

@@ -97,7 +97,8 @@ def headline(findings: Findings) -> list[str]:
     # Without a test, of configurations that share fewer than two seeds, nobody is surely the best.
     if findings.comparisons and not ties:
         answer = f"The best is {name}. It ended with {mean}."
-    sentences = [answer, *_ahead(findings), *_solving(findings), *_few(findings)]
+    sentences = [answer, *_decision(findings), *_ahead(findings), *_solving(findings)]
+    sentences += _few(findings)
     speed = _speed(findings)
     if not speed:
         return sentences
@@ -114,6 +115,37 @@ def _alone(findings: Findings, mean: str) -> str:
     gain = f", from {number(float(start.mean()))} before training" if start.size else ""
     seeds = counted(len(best.final), "seed")
     return f"{seeds} of {findings.experiment.env} ended with {mean}{gain}."
+
+
+def _decision(findings: Findings) -> Iterator[str]:
+    """Yields when a sweep until the best is decided stopped, and why."""
+    experiment = findings.experiment
+    decision = experiment.decision
+    if decision is None or not decision.looks:
+        return
+    labels = [part.label for part in experiment.configurations]
+    budget = counted(decision.budget, "seed")
+    seeds = f"{decision.looks[-1]:,} of at most {budget}"
+    contenders = _listed([labels[place] for place in decision.contenders])
+    if len(decision.contenders) == 1:
+        yield f"The sweep stopped after {seeds}: {contenders} is surely the best."
+    elif decision.is_over:
+        yield f"The sweep spent its budget of {budget} without a decision."
+    else:
+        yield f"The sweep has not decided yet, after {seeds}."
+    excluded = [
+        f"{label} after {counted(num_seeds, 'seed')}"
+        for place, (label, num_seeds) in enumerate(zip(labels, decision.num_seeds, strict=True))
+        if place not in decision.contenders
+    ]
+    if excluded:
+        yield (
+            f"Surely below another: {_listed(excluded)} (sequential test, "
+            f"{counted(len(decision.looks), 'look')}; the probability of any wrong exclusion is at "
+            f"most {LEVEL:.0%})."
+        )
+    if len(decision.contenders) > 1:
+        yield f"Any of these may be the best: {contenders}."
 
 
 def _ties(findings: Findings) -> list[Comparison]:
@@ -264,6 +296,11 @@ def caveats(findings: Findings) -> Iterator[str]:
             f"its 95%: if three seeds in ten are of the other group, {min_seeds} seeds show none "
             f"of them {percent(miss_probability)} of the time, so the interval of the mean holds "
             f"the truth at most {percent(1 - miss_probability)} of the time."
+        )
+    if experiment.decision is not None:
+        yield (
+            "The returns decided how many seeds there are, and means, intervals, and p values do "
+            "not account for that. Only the decision does."
         )
     num_failures = sum(int(np.sum(~np.isfinite(result.final))) for result in results)
     if num_failures:

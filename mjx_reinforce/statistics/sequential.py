@@ -29,12 +29,14 @@ class Verdict(NamedTuple):
         is decided
       num_seeds: [C] seeds of each that counted; an excluded configuration needs no more
       looks: how many seeds each contender had at each look so far
+      budget: how many it has at the last look
       is_over: whether no seed is needed any more: the best is decided, or the budget is spent
     """
 
     contenders: list[int]
     num_seeds: list[int]
     looks: list[int]
+    budget: int
     is_over: bool
 
 
@@ -95,7 +97,7 @@ def sequential_test(returns: Sequence[np.ndarray], budget: int, level: float = 0
         open_pairs, lower, is_spent = _step_down(values[:, :end], open_pairs, is_spent, num_choices)
         contenders = [member for member in contenders if member not in lower]
     is_over = len(contenders) == 1 or looks == all_looks
-    return Verdict(contenders, num_seeds, looks, is_over)
+    return Verdict(contenders, num_seeds, looks, budget, is_over)
 
 
 def _with_failures_as_worst(values: np.ndarray) -> np.ndarray:
