@@ -139,6 +139,7 @@ def _text(findings: Findings, drawn: list[charts.Chart]) -> dict[str, Any]:
         "until": steps(findings.until),
         "numbers": {name: place for place, name in enumerate(tables, start=1)},
         "sensitivity": sensitivity,
+        "lost": words.lost(findings),
         "compared": COMPARED,
     }
 

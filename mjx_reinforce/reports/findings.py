@@ -18,6 +18,7 @@ from mjx_reinforce.statistics.survival import (
     restricted_mean,
     time_to_threshold,
 )
+from mjx_reinforce.statistics.tolerance import lower_tolerance
 
 #: So many configurations are compared pair by pair: the best.
 COMPARED = 16
@@ -58,6 +59,8 @@ class Result(NamedTuple):
     final: the last evaluation of each seed, NaN where not finite
     scores: the same, with the worst finite one of the experiment in place of those
     mean, tail: of the scores; the tail is the mean of the worst tenth
+    floor: what at least 90% of all runs return, with 95% confidence; NaN of too few seeds
+    drops: [S] how far each seed ended below its best evaluation
     iqm: of the final returns, see ``statistics.iqm``
     band: the interquartile mean over ``Findings.grid``, arrays [K]; NaN beyond its budget
     seeds: [K, S] the curves on the grid
@@ -70,6 +73,8 @@ class Result(NamedTuple):
     scores: np.ndarray
     mean: Estimate
     tail: float
+    floor: float
+    drops: np.ndarray
     iqm: Estimate
     band: Estimate
     seeds: np.ndarray
@@ -184,6 +189,8 @@ def _result(
         scores=scores,
         mean=estimate_mean(scores),
         tail=float(cvar(scores)),
+        floor=lower_tolerance(final),
+        drops=finite_returns.max(axis=0) - scores,
         iqm=Estimate(iqm(final), *iqm_interval(final)),
         band=Estimate(iqm(seeds), *iqm_interval(seeds)),
         seeds=seeds,
@@ -249,6 +256,18 @@ def compare_speeds(results: Sequence[Result]) -> dict[tuple[int, int], float]:
         for i, j in pairs
     ]
     return dict(zip(pairs, holm(p_values).tolist(), strict=True))
+
+
+def lost_by_lot(findings: Findings) -> float:
+    """Returns what share of the best's gain a configuration drawn by lot lacks, on average.
+
+    A gain is from the mean return before training to that of a configuration at the end. NaN where
+    the best gains nothing.
+    """
+    starts = [result.configuration.eval_return[0] for result in findings.results]
+    start = np.nanmean(np.concatenate(starts))
+    gains = np.array([result.mean.value for result in findings.results]) - start
+    return float(1 - gains.mean() / gains[0]) if gains[0] > 0 else math.nan
 
 
 def swept(findings: Findings) -> list[str]:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from mjx_reinforce.reports.experiment import Experiment, counted, ordered, say, setting_in_words
-from mjx_reinforce.reports.findings import COMPARED, Findings, by_speed
+from mjx_reinforce.reports.findings import COMPARED, Findings, by_speed, lost_by_lot
 from mjx_reinforce.settings.defaults import OF_TASKS
 from mjx_reinforce.statistics import Estimate, enough
 from mjx_reinforce.statistics.comparisons import Comparison, seeds_needed, wrong_winner
@@ -217,6 +217,18 @@ def _solving(findings: Findings) -> Iterator[str]:
 def solved(experiment: Experiment) -> str:
     """Returns what a task counts as solved."""
     return f"a return of {number(experiment.threshold or 0.0)}, the threshold of {experiment.env}"
+
+
+def lost(findings: Findings) -> str:
+    """Returns in a number how much the settings matter, or nothing where nothing was gained."""
+    share = lost_by_lot(findings)
+    if math.isnan(share):
+        return ""
+    return (
+        f"Of these {len(findings.results):,} configurations, one drawn by lot lacks "
+        f"{100 * share:.0f}% of the best's gain, on average. 0% means that the settings do not "
+        "matter within the values tried."
+    )
 
 
 def two_ways(findings: Findings) -> str:
