@@ -7,6 +7,7 @@ import numpy as np
 
 from mjx_reinforce.reports.experiment import Experiment, counted, ordered, say, setting_in_words
 from mjx_reinforce.reports.findings import COMPARED, Findings, by_speed, lost_by_lot
+from mjx_reinforce.reports.tasks import TaskFindings
 from mjx_reinforce.settings.defaults import OF_TASKS
 from mjx_reinforce.statistics import Estimate, enough
 from mjx_reinforce.statistics.comparisons import Comparison, seeds_needed, wrong_winner
@@ -283,6 +284,37 @@ def _speed(findings: Findings) -> str:
     if len(slower_labels) == len(labels) - 1:
         return f"The fastest is {labels[fastest]}"
     return f"{labels[fastest]} is surely faster than {_listed(slower_labels)}"
+
+
+def score(value: float) -> str:
+    """Returns a score in words, with three decimals."""
+    return "none" if math.isnan(value) else f"{value:.3f}"
+
+
+def over_tasks(findings: TaskFindings) -> Iterator[str]:
+    """Yields the answer of several tasks: who is best, by how much, how much settings matter."""
+    best, *others = findings.standings
+    tasks = counted(len(findings.tasks), "task")
+    mean = f"a mean score of {score(float(best.mean.value))} ({within(best.mean, score)})"
+    if not others:
+        yield f"Over {tasks}, {best.label} ended with {mean}."
+        return
+    yield f"Over {tasks}, the best by the mean is {best.label}. It ended with {mean}."
+    next_best = others[0]
+    yield (
+        f"The mean is {score(float(next_best.behind.value))} above that of the next, "
+        f"{next_best.label} ({within(next_best.behind, score)})."
+    )
+    # An interval that is NaN tells nothing apart.
+    ties = [standing.label for standing in others if not standing.behind.low > 0]
+    if ties:
+        yield f"The best cannot be told from {_listed(ties)}: the interval of the difference has 0."
+    yield (
+        "With the best configuration of each task in place of one for all, the mean score is "
+        f"{score(findings.gain_by_tuning)} higher: so sensitive are these configurations to the "
+        "task. As each task's best owes part of its lead to luck, this number is a little too "
+        "large."
+    )
 
 
 def caveats(findings: Findings) -> Iterator[str]:
