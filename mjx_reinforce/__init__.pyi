@@ -40,7 +40,9 @@ from mjx_reinforce.statistics.comparisons import (
     paired_difference,
     probability_of_improvement,
 )
+from mjx_reinforce.statistics.sequential import sequential_test
 from mjx_reinforce.statistics.survival import kaplan_meier, log_rank
+from mjx_reinforce.statistics.tolerance import lower_tolerance
 from mjx_reinforce.training.driver import Evaluation
 from mjx_reinforce.training.programs import evaluate
 

@@ -180,6 +180,7 @@ def _compiled_stages(
     programs: dict[int, Compiled] = {}
 
     def compile(group_plan: GroupPlan) -> Compiled:
+        """Returns the programs of a group, those that it kept if it has some."""
         group_number = int(group_plan.group.members[0])
         if group_number in programs:
             return programs[group_number]

@@ -67,9 +67,9 @@ def sequential_test(returns: Sequence[np.ndarray], budget: int, level: float = 0
 
     Examples:
       >>> import numpy as np
-      >>> from mjx_reinforce.statistics.sequential import sequential_test
+      >>> import mjx_reinforce as mr
       >>> seeds = np.arange(64.0)
-      >>> verdict = sequential_test([np.sin(seeds), np.sin(seeds) + 1], budget=64)
+      >>> verdict = mr.sequential_test([np.sin(seeds), np.sin(seeds) + 1], budget=64)
       >>> verdict.contenders, verdict.looks
       ([1], [8, 16])
     """

@@ -26,8 +26,8 @@ def lower_tolerance(values: ArrayLike, share: float = 0.9, confidence: float = 0
 
     Examples:
       >>> import numpy as np
-      >>> from mjx_reinforce.statistics.tolerance import lower_tolerance
-      >>> lower_tolerance(np.arange(29.0)), lower_tolerance(np.arange(46.0))
+      >>> import mjx_reinforce as mr
+      >>> mr.lower_tolerance(np.arange(29.0)), mr.lower_tolerance(np.arange(46.0))
       (0.0, 1.0)
     """
     sorted_values = np.sort(worst_if_not_finite(values))
