@@ -40,7 +40,9 @@ from mjx_reinforce.statistics.comparisons import (
     paired_difference,
     probability_of_improvement,
 )
+from mjx_reinforce.statistics.sequential import sequential_test
 from mjx_reinforce.statistics.survival import kaplan_meier, log_rank
+from mjx_reinforce.statistics.tolerance import lower_tolerance
 from mjx_reinforce.training.driver import Evaluation
 from mjx_reinforce.training.programs import evaluate
 
@@ -99,6 +101,7 @@ __all__ = [
     "load",
     "load_policy",
     "log_rank",
+    "lower_tolerance",
     "make_optimizer",
     "make_vec",
     "mean_interval",
@@ -117,6 +120,7 @@ __all__ = [
     "rollout",
     "run",
     "save_policy",
+    "sequential_test",
     "standardize",
     "sweep",
     "tanh_normal",

@@ -1,9 +1,11 @@
 """``python -m mjx_reinforce.report RUN_OR_SWEEP`` makes a page of what runs and sweeps found."""
 
 import dataclasses
+import re
 import shlex
 import sys
 import time
+import urllib.parse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +21,7 @@ from mjx_reinforce.reports.charts import Table, render_chart, rows, short
 from mjx_reinforce.reports.document import encoded
 from mjx_reinforce.reports.experiment import Experiment, say
 from mjx_reinforce.reports.findings import Findings, compute_findings, swept, worst_seeds
+from mjx_reinforce.reports.tasks import compare_tasks, draw_profile, score_rows
 from mjx_reinforce.settings.config import code_flags
 from mjx_reinforce.settings.flags import run_command
 from mjx_reinforce.setup.provenance import version
@@ -36,7 +39,8 @@ class ReportSettings:
     """
 
     sources: tyro.conf.Positional[tuple[Path, ...]]
-    """Directories of runs or sweeps of one task."""
+    """Directories of runs or sweeps. Those of several tasks make a page that compares scores over
+    all tasks, with a page of each task behind it."""
     output: Path | None = None
     """The page. By default report.html in the directory of the run or sweep; if there are several,
     in the current folder. Pictures and tables go into a folder of that name, without .html; where
@@ -63,20 +67,24 @@ def _report(settings: ReportSettings) -> None:
     pages = [str(path) for path in settings.sources if path not in chosen]
     if pages:
         print(f"left out, for they are reports: {', '.join(pages)}")
-    experiment = sources.read_experiment(chosen)
+    start = time.perf_counter()
+    experiments = sources.read_tasks(chosen)
     # Where the page goes by default is known only now; a place that the user names was checked
     # above, before the sources were read.
     output = settings.output or _default_output(chosen)
     check_page(output, settings.overwrite)
     try:
-        seconds = _write(experiment, output).seconds
+        if len(experiments) == 1:
+            _write(experiments[0], output)
+        else:
+            _write_tasks(experiments, output)
     except OSError as error:
         reason = str(error)
         if not output.parent.is_dir():
             reason = f"{output.parent} was moved or removed"
         say_error(f"cannot write {output}: {reason}")
         sys.exit(1)
-    size = f"{output.stat().st_size / 1e6:.1f} MB, {seconds:.1f} s"
+    size = f"{output.stat().st_size / 1e6:.1f} MB, {time.perf_counter() - start:.1f} s"
     print(f"{output} ({size}), pictures and tables in {_beside(output)}")
 
 
@@ -126,10 +134,41 @@ def write_report(chosen: Sequence[Path], output: Path) -> WrittenReport:
     return _write(sources.read_experiment(chosen), output)
 
 
+def _write_tasks(experiments: Sequence[Experiment], output: Path) -> None:
+    """Writes the page of several tasks, and that of each into the folder beside it."""
+    tasks = [compute_findings(experiment) for experiment in experiments]
+    findings = compare_tasks(tasks)
+    folder = _beside(output)
+    folder.mkdir(exist_ok=True)
+    pages = []
+    for number, task in enumerate(tasks, start=1):
+        # Names of tasks may have letters that file systems refuse.
+        name = re.sub(r"[^\w.-]", "-", task.experiment.env)
+        page = folder / f"{number}-{name}.html"
+        _write_findings(task, page, time.perf_counter())
+        pages.append(urllib.parse.quote(str(page.relative_to(output.parent))))
+    profile = draw_profile(findings)
+    labels = [standing.label for standing in findings.standings]
+    pictures = render_chart(profile, labels, f"{len(tasks)} tasks")
+    for ending, picture in pictures.items():
+        write_bytes(folder / f"{profile.name}.{ending}", picture)
+    for name, table in profile.data.items():
+        write_bytes(folder / f"{name}.csv", encoded(table_csv(table, labels)))
+    write_bytes(folder / "results.csv", encoded(csv_text(score_rows(findings))))
+    package_version = version("mjx-reinforce") or "not installed"
+    text = document.render_tasks(findings, pictures["svg"], pages, package_version)
+    write_bytes(output, encoded(text))
+
+
 def _write(experiment: Experiment, output: Path) -> WrittenReport:
     """Writes the page of an experiment; see ``write_report``."""
     start = time.perf_counter()
-    findings = compute_findings(experiment)
+    return _write_findings(compute_findings(experiment), output, start)
+
+
+def _write_findings(findings: Findings, output: Path, start: float) -> WrittenReport:
+    """Writes the page of findings that were begun at a time; see ``write_report``."""
+    experiment = findings.experiment
     charts = document.draw_charts(findings)
     labels = findings.labels
     folder = _beside(output)

@@ -22,6 +22,7 @@ from mjx_reinforce.reports.charts import (
 from mjx_reinforce.reports.experiment import Experiment, counted, say, setting_in_words
 from mjx_reinforce.reports.findings import COMPARED, Findings
 from mjx_reinforce.reports.listings import listings
+from mjx_reinforce.reports.tasks import TaskFindings, draw_profile
 from mjx_reinforce.reports.words import steps
 from mjx_reinforce.statistics import enough
 
@@ -76,20 +77,12 @@ def render(
         "row": distribution.ROW,
         "light": charts.LIGHT,
     }
-    # Labels and paths are other people's text: all is escaped but what ``Markup`` exempts.
-    loader = jinja2.Environment(
-        loader=jinja2.FunctionLoader(_read_template),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return loader.get_template("page.html").render(
+    return _template("page.html").render(
         **_text(findings, drawn),
         **provenance_rows(findings.experiment),
         watch=watch,
         moments=stops,
-        date=f"{datetime.date.today():%d %B %Y}".lstrip("0"),
+        date=_today(),
         version=version,
         seconds=f"{seconds:.1f} s",
         findings=findings,
@@ -100,6 +93,24 @@ def render(
         vega_bundle=Markup(vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;")),
         content=Markup(_json(content)),
     )
+
+
+def _today() -> str:
+    """Returns the date, "29 November 2026"."""
+    return f"{datetime.date.today():%d %B %Y}".lstrip("0")
+
+
+def _template(name: str) -> jinja2.Template:
+    """Returns a template of a page."""
+    # Labels and paths are other people's text: all is escaped but what ``Markup`` exempts.
+    loader = jinja2.Environment(
+        loader=jinja2.FunctionLoader(_read_template),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return loader.get_template(name)
 
 
 def _read_template(name: str) -> str:
@@ -139,6 +150,7 @@ def _text(findings: Findings, drawn: list[charts.Chart]) -> dict[str, Any]:
         "until": steps(findings.until),
         "numbers": {name: place for place, name in enumerate(tables, start=1)},
         "sensitivity": sensitivity,
+        "lost": words.lost(findings),
         "compared": COMPARED,
     }
 
@@ -177,3 +189,28 @@ def _in_words(value: object) -> str:
     if isinstance(value, list):
         return ", ".join(map(_in_words, value))
     return say(value)
+
+
+def render_tasks(findings: TaskFindings, picture: bytes, pages: list[str], version: str) -> str:
+    """Returns the page of several tasks.
+
+    Args:
+      findings: the figures.
+      picture: the profile as SVG.
+      pages: the addresses of the tasks' own pages, from this one.
+      version: of this program.
+    """
+    return _template("tasks.html").render(
+        findings=findings,
+        charts=charts,
+        tasks=[*zip(findings.tasks, findings.scales, pages, strict=True)],
+        answer=[*words.over_tasks(findings)],
+        profile=draw_profile(findings),
+        picture=Markup(picture.decode()),
+        score=words.score,
+        number=words.number,
+        interval=lambda estimate: words.interval_in_words(estimate, words.score),
+        date=_today(),
+        version=version,
+        css=Markup(_read_template("page.css")),
+    )

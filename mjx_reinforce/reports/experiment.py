@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjx_reinforce.statistics.sequential import Verdict
+
 
 class Configuration(NamedTuple):
     """One choice of settings, trained with S seeds and evaluated E times.
@@ -38,6 +40,7 @@ class Source(NamedTuple):
     provenance: versions, device, commit, command
     timings: seconds by name, of compiling and running
     status: "running", "interrupted" or "finished"
+    decision: of a sweep until the best is decided, see ``statistics.sequential.Verdict``
     """
 
     directory: Path
@@ -48,11 +51,13 @@ class Source(NamedTuple):
     provenance: dict[str, Any]
     timings: dict[str, float]
     status: str
+    decision: Verdict | None = None
 
 
 class Experiment(NamedTuple):
     """All that a report is drawn from; the fields are named as those of ``Source``.
 
+    decision: that of a sweep that is the only source, about its configurations
     directories: of each configuration, where it was read
     unfinished: the directories whose training goes on or was interrupted
     disagree: names in the provenance of which the sources say different things
@@ -68,6 +73,7 @@ class Experiment(NamedTuple):
     directories: list[Path]
     unfinished: list[Path]
     disagree: list[str]
+    decision: Verdict | None = None
 
 
 def settings_in_words(settings: Mapping[str, Any]) -> str:

@@ -1,6 +1,5 @@
 """The figures of a report: what an experiment's numbers say, best configuration first."""
 
-import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ from mjx_reinforce.statistics.survival import (
     restricted_mean,
     time_to_threshold,
 )
+from mjx_reinforce.statistics.tolerance import lower_tolerance
 
 #: So many configurations are compared pair by pair: the best.
 COMPARED = 16
@@ -59,6 +59,8 @@ class Result(NamedTuple):
     final: the last evaluation of each seed, NaN where not finite
     scores: the same, with the worst finite one of the experiment in place of those
     mean, tail: of the scores; the tail is the mean of the worst tenth
+    floor: what at least 90% of all runs return, with 95% confidence; NaN of too few seeds
+    drops: [S] how far each seed ended below its best evaluation
     iqm: of the final returns, see ``statistics.iqm``
     band: the interquartile mean over ``Findings.grid``, arrays [K]; NaN beyond its budget
     seeds: [K, S] the curves on the grid
@@ -71,6 +73,8 @@ class Result(NamedTuple):
     scores: np.ndarray
     mean: Estimate
     tail: float
+    floor: float
+    drops: np.ndarray
     iqm: Estimate
     band: Estimate
     seeds: np.ndarray
@@ -81,7 +85,7 @@ class Result(NamedTuple):
 class Findings(NamedTuple):
     """All figures of a report.
 
-    results: best first, see ``_rank``
+    results: best first, see ``_rank``; behind all others what a sweep excluded while it went on
     order: of each result, the place of its configuration in the experiment
     grid: [K] env steps
     comparisons: of all pairs of the best results, which are numbered by their places here
@@ -122,7 +126,10 @@ def compute_findings(experiment: Experiment) -> Findings:
         for part in parts
     ]
     # From here on a configuration is known by its rank; ``order`` leads back to the sources.
-    order = sorted(range(len(results)), key=lambda i: _rank(results[i]))
+    contenders = range(len(results))
+    if experiment.decision is not None:
+        contenders = experiment.decision.contenders
+    order = sorted(range(len(results)), key=lambda i: (i not in contenders, *_rank(results[i])))
     ranked_results = [results[i] for i in order]
     return Findings(
         experiment,
@@ -182,6 +189,8 @@ def _result(
         scores=scores,
         mean=estimate_mean(scores),
         tail=float(cvar(scores)),
+        floor=lower_tolerance(final),
+        drops=finite_returns.max(axis=0) - scores,
         iqm=Estimate(iqm(final), *iqm_interval(final)),
         band=Estimate(iqm(seeds), *iqm_interval(seeds)),
         seeds=seeds,
@@ -219,15 +228,12 @@ def _rank(result: Result) -> tuple[float, ...]:
 
 
 def _compare_pairs(results: Sequence[Result]) -> list[Comparison]:
-    """Compares the scores of all pairs, on the seeds that all of them have."""
+    """Compares the scores of all pairs, each on the seeds that both have."""
     seeds = [result.configuration.seed for result in results]
-    shared_seeds = functools.reduce(np.intersect1d, seeds)
-    if len(results) < 2 or len(shared_seeds) < 2:
+    pairs = itertools.combinations(seeds, 2)
+    if min((np.intersect1d(*pair).size for pair in pairs), default=0) < 2:
         return []
-    # Seeds ascend in every source, so that the shared ones stand in one order.
-    return compare_all(
-        [result.scores[np.isin(result.configuration.seed, shared_seeds)] for result in results]
-    )
+    return compare_all([result.scores for result in results], seeds)
 
 
 def by_speed(results: Sequence[Result]) -> list[int]:
@@ -250,6 +256,18 @@ def compare_speeds(results: Sequence[Result]) -> dict[tuple[int, int], float]:
         for i, j in pairs
     ]
     return dict(zip(pairs, holm(p_values).tolist(), strict=True))
+
+
+def lost_by_lot(findings: Findings) -> float:
+    """Returns what share of the best's gain a configuration drawn by lot lacks, on average.
+
+    A gain is from the mean return before training to that of a configuration at the end. NaN where
+    the best gains nothing.
+    """
+    starts = [result.configuration.eval_return[0] for result in findings.results]
+    start = np.nanmean(np.concatenate(starts))
+    gains = np.array([result.mean.value for result in findings.results]) - start
+    return float(1 - gains.mean() / gains[0]) if gains[0] > 0 else math.nan
 
 
 def swept(findings: Findings) -> list[str]:

@@ -8,7 +8,8 @@ import numpy as np
 from mjx_reinforce.reports import words
 from mjx_reinforce.reports.findings import COMPARED, Findings, Result, by_speed, worst_seeds
 from mjx_reinforce.reports.words import interval_in_words, number, percent, short_p, steps
-from mjx_reinforce.statistics import Estimate
+from mjx_reinforce.statistics import Estimate, estimate_mean
+from mjx_reinforce.statistics.tolerance import tolerance_seeds
 
 #: A table: its ``header``, and ``rows`` of a ``label`` and ``cells``, pairs of a value and what
 #: stands below it. Where the header has a column more, the first is the rank of the row.
@@ -19,6 +20,7 @@ def listings(findings: Findings) -> dict[str, Listing]:
     """Returns the tables of a report by name, in the order of the page."""
     tables = {
         "results": _results_table(findings),
+        "reliability": _reliability_table(findings),
         "speed": _speed_table(findings),
         "against": _against(findings),
         "worst": _worst(findings),
@@ -56,6 +58,19 @@ def _results_table(findings: Findings) -> Listing:
         cells.append((f"{int(np.sum(~np.isfinite(result.final))):,}", ""))
         rows.append(_row(result, cells))
     return {"header": [*header, "not finite"], "rows": rows}
+
+
+def _reliability_table(findings: Findings) -> Listing:
+    """Returns the table of what nearly all runs return, and of drops after the peak."""
+    header = ["", "configuration", "90% of runs return at least", "drop after the peak"]
+    rows = []
+    for result in findings.results:
+        floor = number(result.floor)
+        if len(result.final) < tolerance_seeds():
+            floor = f"needs {tolerance_seeds()} seeds"
+        largest = number(float(result.drops.max()))
+        rows.append(_row(result, [(floor, ""), _cell(estimate_mean(result.drops)), (largest, "")]))
+    return {"header": [*header, "largest drop"], "rows": rows}
 
 
 def _speed_table(findings: Findings) -> Listing:

@@ -22,6 +22,7 @@ from mjx_reinforce.reports.experiment import (
     setting_in_words,
     settings_in_words,
 )
+from mjx_reinforce.statistics.sequential import Verdict
 
 #: What config.json says besides the settings.
 PROVENANCE = (
@@ -41,7 +42,16 @@ PROVENANCE = (
 )
 _TIMINGS = ("compile_seconds", "run_seconds", "statistics_seconds")
 #: What sweep.json says of the sweep itself; all else is its provenance.
-_SWEEP_KEYS = ("status", "env", "threshold", "settings", "configurations", *_TIMINGS)
+_SWEEP_KEYS = (
+    "status",
+    "env",
+    "threshold",
+    "settings",
+    "configurations",
+    "until_decided",
+    "decision",
+    *_TIMINGS,
+)
 #: The columns and arrays that are read, and their types.
 _METRICS = {"seed": np.int64, "env_steps": np.int64, "eval_return": np.float64}
 #: How the columns of the reward's terms begin.
@@ -61,8 +71,8 @@ _HOUSEKEEPING = ("output", "resume", "like", "checkpoint_every", "log", "num_see
 _COMPARABLE = ("python", "packages", "git_commit", "device", "x64", "engine")
 
 
-def read_experiment(paths: Sequence[Path]) -> Experiment:
-    """Reads run directories and sweep directories as one experiment.
+def read_tasks(paths: Sequence[Path]) -> list[Experiment]:
+    """Reads run directories and sweep directories as an experiment of each task.
 
     The configurations of a sweep are told apart by what it swept; those of several sources by the
     settings in which they differ too, or else by the names of their directories. Shares of a run or
@@ -70,8 +80,7 @@ def read_experiment(paths: Sequence[Path]) -> Experiment:
 
     Raises:
       ValueError: there is no source, one is named twice, is neither a run nor a sweep or is damaged
-        (which file, what is wrong in it), they are of different tasks, or shares do not fit each
-        other.
+        (which file, what is wrong in it), or shares do not fit each other.
     """
     if not paths:
         raise ValueError("there is nothing to report on: name a run or a sweep directory")
@@ -81,13 +90,27 @@ def read_experiment(paths: Sequence[Path]) -> Experiment:
         earlier_path = path_of_folder.setdefault(path.resolve(), path)
         if earlier_path is not path:
             raise ValueError(f"{earlier_path} and {path} are one directory: name each source once")
-    sources = [read_directory(path) for path in path_of_folder.values()]
-    envs = list(dict.fromkeys(source.env for source in sources))
-    if len(envs) > 1:
+    sources_of_task: dict[str, list[Source]] = {}
+    for path in path_of_folder.values():
+        source = read_directory(path)
+        sources_of_task.setdefault(source.env, []).append(source)
+    return [_as_experiment(env, sources) for env, sources in sources_of_task.items()]
+
+
+def read_experiment(paths: Sequence[Path]) -> Experiment:
+    """Reads directories of one task, see ``read_tasks``; ValueError where there are several."""
+    experiment, *others = read_tasks(paths)
+    if others:
+        envs = ", ".join(task.env for task in (experiment, *others))
         raise ValueError(
-            f"these are of different tasks ({', '.join(envs)}), whose returns cannot be compared; "
-            "make one page per task, or compare tasks by experiments/examples/all_tasks.py"
+            f"these are of different tasks ({envs}), whose returns cannot be compared; compare "
+            "their scores by python -m mjx_reinforce.report"
         )
+    return experiment
+
+
+def _as_experiment(env: str, sources: Sequence[Source]) -> Experiment:
+    """Returns the sources of a task as one experiment, or raises ValueError, see ``read_tasks``."""
     joined = _join_shares(sources)
     configurations = _told_apart(joined)
     _check_common_seeds(configurations)
@@ -96,8 +119,8 @@ def read_experiment(paths: Sequence[Path]) -> Experiment:
     provenance, disagree = _merge_provenance(sources)
     timings = sum((Counter(source.timings) for source in sources), Counter())
     return Experiment(
-        title=f"{envs[0]}, {counted(len(configurations), 'configuration')}",
-        env=envs[0],
+        title=f"{env}, {counted(len(configurations), 'configuration')}",
+        env=env,
         threshold=next(thresholds, None),
         configurations=configurations,
         settings=_in_common(sources),
@@ -106,6 +129,7 @@ def read_experiment(paths: Sequence[Path]) -> Experiment:
         directories=[source.directory for source in joined for _ in source.configurations],
         unfinished=[source.directory for source in sources if source.status != "finished"],
         disagree=disagree,
+        decision=sources[0].decision if len(sources) == 1 else None,
     )
 
 
@@ -326,8 +350,24 @@ def _read_sweep(directory: Path, content: dict[str, Any]) -> Source:
             configurations=parts,
             settings=content.get("settings", {}),
             provenance={name: x for name, x in content.items() if name not in _SWEEP_KEYS},
+            decision=_read_decision(content.get("decision"), len(swept)),
             **_outcome(content),
         )
+
+
+def _read_decision(record: Mapping[str, Any] | None, num_configurations: int) -> Verdict | None:
+    """Returns the decision of a sweep; None where it makes none.
+
+    Raises:
+      ValueError: it is about other configurations.
+    """
+    if record is None:
+        return None
+    verdict = Verdict(**record)
+    places = range(num_configurations)
+    if len(verdict.num_seeds) != num_configurations or not set(verdict.contenders) <= set(places):
+        raise ValueError(f"decision is not about {counted(num_configurations, 'configuration')}")
+    return verdict
 
 
 def _outcome(content: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from mjx_reinforce.reports.experiment import Experiment, counted, ordered, say, setting_in_words
-from mjx_reinforce.reports.findings import COMPARED, Findings, by_speed
+from mjx_reinforce.reports.findings import COMPARED, Findings, by_speed, lost_by_lot
+from mjx_reinforce.reports.tasks import TaskFindings
 from mjx_reinforce.settings.defaults import OF_TASKS
 from mjx_reinforce.statistics import Estimate, enough
 from mjx_reinforce.statistics.comparisons import Comparison, seeds_needed, wrong_winner
@@ -97,7 +98,8 @@ def headline(findings: Findings) -> list[str]:
     # Without a test, of configurations that share fewer than two seeds, nobody is surely the best.
     if findings.comparisons and not ties:
         answer = f"The best is {name}. It ended with {mean}."
-    sentences = [answer, *_ahead(findings), *_solving(findings), *_few(findings)]
+    sentences = [answer, *_decision(findings), *_ahead(findings), *_solving(findings)]
+    sentences += _few(findings)
     speed = _speed(findings)
     if not speed:
         return sentences
@@ -114,6 +116,37 @@ def _alone(findings: Findings, mean: str) -> str:
     gain = f", from {number(float(start.mean()))} before training" if start.size else ""
     seeds = counted(len(best.final), "seed")
     return f"{seeds} of {findings.experiment.env} ended with {mean}{gain}."
+
+
+def _decision(findings: Findings) -> Iterator[str]:
+    """Yields when a sweep until the best is decided stopped, and why."""
+    experiment = findings.experiment
+    decision = experiment.decision
+    if decision is None or not decision.looks:
+        return
+    labels = [part.label for part in experiment.configurations]
+    budget = counted(decision.budget, "seed")
+    seeds = f"{decision.looks[-1]:,} of at most {budget}"
+    contenders = _listed([labels[place] for place in decision.contenders])
+    if len(decision.contenders) == 1:
+        yield f"The sweep stopped after {seeds}: {contenders} is surely the best."
+    elif decision.is_over:
+        yield f"The sweep spent its budget of {budget} without a decision."
+    else:
+        yield f"The sweep has not decided yet, after {seeds}."
+    excluded = [
+        f"{label} after {counted(num_seeds, 'seed')}"
+        for place, (label, num_seeds) in enumerate(zip(labels, decision.num_seeds, strict=True))
+        if place not in decision.contenders
+    ]
+    if excluded:
+        yield (
+            f"Surely below another: {_listed(excluded)} (sequential test, "
+            f"{counted(len(decision.looks), 'look')}; the probability of any wrong exclusion is at "
+            f"most {LEVEL:.0%})."
+        )
+    if len(decision.contenders) > 1:
+        yield f"Any of these may be the best: {contenders}."
 
 
 def _ties(findings: Findings) -> list[Comparison]:
@@ -187,6 +220,18 @@ def solved(experiment: Experiment) -> str:
     return f"a return of {number(experiment.threshold or 0.0)}, the threshold of {experiment.env}"
 
 
+def lost(findings: Findings) -> str:
+    """Returns in a number how much the settings matter, or nothing where nothing was gained."""
+    share = lost_by_lot(findings)
+    if math.isnan(share):
+        return ""
+    return (
+        f"Of these {len(findings.results):,} configurations, one drawn by lot lacks "
+        f"{100 * share:.0f}% of the best's gain, on average. 0% means that the settings do not "
+        "matter within the values tried."
+    )
+
+
 def two_ways(findings: Findings) -> str:
     """Returns what it means where the best has the higher mean and loses to another, or nothing."""
     labels = [
@@ -241,6 +286,37 @@ def _speed(findings: Findings) -> str:
     return f"{labels[fastest]} is surely faster than {_listed(slower_labels)}"
 
 
+def score(value: float) -> str:
+    """Returns a score in words, with three decimals."""
+    return "none" if math.isnan(value) else f"{value:.3f}"
+
+
+def over_tasks(findings: TaskFindings) -> Iterator[str]:
+    """Yields the answer of several tasks: who is best, by how much, how much settings matter."""
+    best, *others = findings.standings
+    tasks = counted(len(findings.tasks), "task")
+    mean = f"a mean score of {score(float(best.mean.value))} ({within(best.mean, score)})"
+    if not others:
+        yield f"Over {tasks}, {best.label} ended with {mean}."
+        return
+    yield f"Over {tasks}, the best by the mean is {best.label}. It ended with {mean}."
+    next_best = others[0]
+    yield (
+        f"The mean is {score(float(next_best.behind.value))} above that of the next, "
+        f"{next_best.label} ({within(next_best.behind, score)})."
+    )
+    # An interval that is NaN tells nothing apart.
+    ties = [standing.label for standing in others if not standing.behind.low > 0]
+    if ties:
+        yield f"The best cannot be told from {_listed(ties)}: the interval of the difference has 0."
+    yield (
+        "With the best configuration of each task in place of one for all, the mean score is "
+        f"{score(findings.gain_by_tuning)} higher: so sensitive are these configurations to the "
+        "task. As each task's best owes part of its lead to luck, this number is a little too "
+        "large."
+    )
+
+
 def caveats(findings: Findings) -> Iterator[str]:
     """Yields what to distrust in the headline, the gravest first."""
     experiment = findings.experiment
@@ -264,6 +340,11 @@ def caveats(findings: Findings) -> Iterator[str]:
             f"its 95%: if three seeds in ten are of the other group, {min_seeds} seeds show none "
             f"of them {percent(miss_probability)} of the time, so the interval of the mean holds "
             f"the truth at most {percent(1 - miss_probability)} of the time."
+        )
+    if experiment.decision is not None:
+        yield (
+            "The returns decided how many seeds there are, and means, intervals, and p values do "
+            "not account for that. Only the decision does."
         )
     num_failures = sum(int(np.sum(~np.isfinite(result.final))) for result in results)
     if num_failures:

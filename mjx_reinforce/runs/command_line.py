@@ -76,7 +76,12 @@ def parse(arguments: Sequence[str], name: str = "train") -> Design:
         if name == "sweep":
             check_swept(swept)
         return Design(
-            base=base, default=default, over=swept, exact=sweep.exact, chunk_runs=sweep.chunk_runs
+            base=base,
+            default=default,
+            over=swept,
+            exact=sweep.exact,
+            chunk_runs=sweep.chunk_runs,
+            until_decided=sweep.until_decided,
         )
     directory = base.resume
     design = read_design(directory)

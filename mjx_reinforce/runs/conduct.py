@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import itertools
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 from mjx_reinforce.console.interrupt import Interrupt
@@ -48,15 +48,14 @@ def conduct(
     """
     # No loop below runs for the files of a run that leaves none.
     own_files = [] if files is None else [files]
-    unfinished_groups = _unfinished(plan.group_plans, own_files)
     screen = display
     if plan.design.is_sweep:
-        screen = SweepScreen(display, plan, unfinished_groups)
+        screen = SweepScreen(display, plan, _unfinished(plan.group_plans, own_files))
     # The files are first: an error of theirs ends the run before a user's function sees an
     # evaluation that is nowhere on the disk.
     all_observers = [*own_files, screen, *observers]
     clock = plan.clock
-    compiled_chunks = _first_compiled(unfinished_groups, plan)
+    compiled_chunks = _first_compiled(_unfinished_stages(plan, files), plan)
     # Not before: a kill while it compiles leaves nothing that would refuse the next.
     interrupt.defer(display.say)
     for run_files in own_files:
@@ -83,7 +82,7 @@ def conduct(
             break
     if plan.design.is_sweep:
         assert files is not None
-        summary = sweep_summary(files.contents, driver, clock)
+        summary = sweep_summary(files.contents, driver, clock) | files.outcome()
     else:
         assert isinstance(driver, RunDriver)
         # A signal after that changes nothing: what is left takes a second or two.
@@ -94,13 +93,22 @@ def conduct(
     return driver, summary
 
 
+def _unfinished_stages(plan: Plan, files: Files[Any] | None) -> Iterator[list[GroupPlan]]:
+    """Yields what is left to train of each stage, once those before have ended."""
+    if files is None:
+        yield plan.group_plans
+        return
+    for group_plans in files.stages():
+        yield _unfinished(group_plans, [files])
+
+
 def _unfinished(group_plans: Sequence[GroupPlan], own_files: Sequence[Files]) -> list[GroupPlan]:
     """Returns the groups of which some chunks have not ended yet, with these chunks alone."""
     unfinished_groups = []
     for group_plan in group_plans:
         chunks = [x for x in group_plan.chunks if not any(files.has(x.name) for files in own_files)]
         if chunks:
-            unfinished_groups.append(group_plan._replace(chunks=chunks))
+            unfinished_groups.append(group_plan._replace(stages=[chunks]))
     return unfinished_groups
 
 
@@ -146,16 +154,18 @@ def _begin(
 
 
 def _compiled(
-    group_plans: Sequence[GroupPlan], clock: Stopwatch
+    group_plans: Sequence[GroupPlan],
+    clock: Stopwatch,
+    compile: Callable[[GroupPlan], Compiled],
 ) -> Iterator[tuple[GroupPlan, Runs, Compiled]]:
     """Yields chunks with the programs of their group; those of the next compile meanwhile."""
     # A list with the task of the group that is next, or with none behind the last one.
-    compilations = [functools.partial(_compile, group_plan) for group_plan in group_plans[:1]]
+    compilations = [functools.partial(compile, group_plan) for group_plan in group_plans[:1]]
     for group_number, group_plan in enumerate(group_plans, start=1):
         compiled_programs = clock.wait(compilations.pop())
         # One group ahead, and not all: compiling takes memory and cores from what trains.
         next_compilations = [
-            functools.partial(_compile, next_plan)
+            functools.partial(compile, next_plan)
             for next_plan in group_plans[group_number : group_number + 1]
         ]
         compilations = [started(compilation).result for compilation in next_compilations]
@@ -163,21 +173,42 @@ def _compiled(
             yield group_plan, runs, compiled_programs
 
 
-def _first_compiled(
-    group_plans: Sequence[GroupPlan], plan: Plan
+def _compiled_stages(
+    stages: Iterable[Sequence[GroupPlan]], plan: Plan
 ) -> Iterator[tuple[GroupPlan, Runs, Compiled]]:
-    """Returns ``_compiled`` of groups, whose first programs are compiled now, before anything runs.
+    """Yields ``_compiled`` of each stage; if there may be several, groups keep their programs."""
+    programs: dict[int, Compiled] = {}
+
+    def compile(group_plan: GroupPlan) -> Compiled:
+        """Returns the programs of a group, those that it kept if it has some."""
+        group_number = int(group_plan.group.members[0])
+        if group_number in programs:
+            return programs[group_number]
+        compiled_programs = _compile(group_plan)
+        if plan.design.until_decided:
+            programs[group_number] = compiled_programs
+        return compiled_programs
+
+    for group_plans in stages:
+        yield from _compiled(group_plans, plan.clock, compile)
+
+
+def _first_compiled(
+    stages: Iterable[Sequence[GroupPlan]], plan: Plan
+) -> Iterator[tuple[GroupPlan, Runs, Compiled]]:
+    """Returns ``_compiled`` of stages, whose first programs are compiled now, before anything runs.
 
     How long that took is on the plan's clock, and kept for the forecast of later runs.
     """
     clock = plan.clock
-    compiled_chunks = _compiled(group_plans, clock)
+    compiled_chunks = _compiled_stages(stages, plan)
     # A generator does nothing before it is asked: the first chunk is taken from it, and put back.
-    compiled_chunks = itertools.chain([*itertools.islice(compiled_chunks, 1)], compiled_chunks)
+    first_chunks = [*itertools.islice(compiled_chunks, 1)]
+    compiled_chunks = itertools.chain(first_chunks, compiled_chunks)
     clock.compiling = time.perf_counter() - clock.began
     # Where others compute beside this, what it computed itself is nearer to a quiet machine's time.
     quiet_seconds = min(clock.compiling, time.process_time() - clock.computed)
-    if group_plans:
+    if first_chunks:
         keep_seconds(plan.design.configs[0], plan.design.over, quiet_seconds)
     return compiled_chunks
 

@@ -27,6 +27,7 @@ from mjx_reinforce.settings.config import (
     spoken,
 )
 from mjx_reinforce.settings.groups import LogSettings
+from mjx_reinforce.statistics import enough
 from mjx_reinforce.training.resume import as_config, read_record, recordable
 
 #: What writing curves.npz and a report needs for a run with two evaluations (bytes).
@@ -45,6 +46,10 @@ class SweepSettings:
     exact: bool = False
     """Train one run at a time, on one device. No bit of a result then depends on other runs,
     chunks, or the number of devices. It takes many times as long."""
+    until_decided: bool = False
+    """Train an eighth of --num-seeds at a time, and stop when one configuration is surely the best.
+    Configurations that are surely below another get no more seeds. Each such statement, over all
+    looks and pairs together, is wrong at most 5% of the time."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -57,6 +62,7 @@ class Design:
       each that differs. None where nobody chose
     exact: see ``SweepSettings``
     chunk_runs: see ``SweepSettings``
+    until_decided: see ``SweepSettings``
     """
 
     base: Config
@@ -64,6 +70,7 @@ class Design:
     default: Config | None = None
     exact: bool = False
     chunk_runs: int | None = None
+    until_decided: bool = False
 
     @property
     def is_sweep(self) -> bool:
@@ -107,7 +114,12 @@ class Design:
 def as_record(design: Design) -> dict[str, Any]:
     """Returns what sweep.json says of a design: all that decides its numbers."""
     swept_values = {name: list(setting_values) for name, setting_values in design.over.items()}
-    return {"settings": recordable(design.base), "over": swept_values, "exact": design.exact}
+    return {
+        "settings": recordable(design.base),
+        "over": swept_values,
+        "exact": design.exact,
+        "until_decided": design.until_decided,
+    }
 
 
 def read_design(directory: Path) -> Design:
@@ -125,13 +137,15 @@ def read_design(directory: Path) -> Design:
     with naming_damage(record_path):
         settings = dict(record["settings"])
         is_exact = record["exact"]
+        # Sweeps of earlier versions of the package train all their seeds, and do not say so.
+        until_decided = record.get("until_decided", False)
         # JSON has no tuples: a list among the values is one of layers, as ``read_over`` has it.
         swept_values = {
             name: [tuple(x) if isinstance(x, list) else x for x in values]
             for name, values in record["over"].items()
         }
     base = dataclasses.replace(as_config(settings, record_path), resume=directory)
-    return Design(base=base, over=swept_values, exact=is_exact)
+    return Design(base=base, over=swept_values, exact=is_exact, until_decided=until_decided)
 
 
 def check_design(design: Design) -> None:
@@ -167,7 +181,23 @@ def _check_sweep(design: Design) -> None:
             raise ValueError(f"{flag(name)} is for one run, not for a sweep: leave it out")
     if design.chunk_runs is not None and design.chunk_runs < 1:
         raise ValueError(f"--chunk-runs must be at least 1, got {design.chunk_runs}")
+    if design.until_decided:
+        _check_until_decided(design.base)
     check_over(design.base, design.over)
+
+
+def _check_until_decided(base: Config) -> None:
+    """Raises ValueError if no test of so many seeds, or of these seeds, can decide a sweep."""
+    if base.seeds is not None:
+        raise ValueError(
+            f"--until-decided looks at all seeds, and --seeds {base.seeds} is a share of them: "
+            "leave one out"
+        )
+    if not enough(base.num_seeds):
+        raise ValueError(
+            f"--until-decided cannot decide with {base.num_seeds} seeds: raise --num-seeds, the "
+            "most seeds of a configuration, to 6 or more, such as 64"
+        )
 
 
 _SETTINGS = {field.name: field for field in dataclasses.fields(Config)}

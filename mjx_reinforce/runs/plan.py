@@ -5,6 +5,7 @@ run is one configuration, whose seeds are one chunk in one slot.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ from mjx_reinforce.settings.defaults import num_cores
 from mjx_reinforce.settings.groups import Reader
 from mjx_reinforce.setup.provenance import provenance
 from mjx_reinforce.setup.ready import Ready, load_or_build_ready
+from mjx_reinforce.statistics.sequential import look_seeds
 from mjx_reinforce.training import resume
 from mjx_reinforce.training.division import Division
 from mjx_reinforce.training.driver import Runs
@@ -56,14 +58,20 @@ class GroupPlan(NamedTuple):
     ready: what their programs are made of
     limit: how many of its runs a chunk may have
     width: runs that a compiled program moves at once
-    chunks: its runs, all chunks of about the same size
+    stages: its runs in chunks, all of about the same size; of one stage, but where a sweep looks
+      at its results after each
     """
 
     group: Group
     ready: Ready
     limit: int
     width: int
-    chunks: list[Runs]
+    stages: list[list[Runs]]
+
+    @property
+    def chunks(self) -> list[Runs]:
+        """The chunks of all stages."""
+        return [runs for chunks in self.stages for runs in chunks]
 
 
 class Plan(NamedTuple):
@@ -136,7 +144,7 @@ def make_plan(
         ready=ready_programs,
         limit=config.num_seeds,
         width=division.capacity(config.num_seeds),
-        chunks=split_runs(group, "000", 1),
+        stages=[split_runs(group, "000", 1)],
     )
     return Plan(design, [group_plan], division, saved_record, checkpoint, actors, clock)
 
@@ -228,10 +236,27 @@ def _plan_sweep(
             max_chunk_runs = min(
                 max(_capacity(group, ready_programs), division.count), group.num_runs
             )
-        num_chunks, slot_width = divide(group, max_chunk_runs, division.count, exact=design.exact)
-        chunks = split_runs(group, f"{group_number:03d}", num_chunks)
-        group_plans.append(GroupPlan(group, ready_programs, max_chunk_runs, slot_width, chunks))
+        name = f"{group_number:03d}"
+        parts = {name: group}
+        if design.until_decided:
+            parts = _split_seeds(group, name)
+        divisions = {
+            name: divide(part, max_chunk_runs, division.count, exact=design.exact)
+            for name, part in parts.items()
+        }
+        stages = [split_runs(parts[name], name, divisions[name][0]) for name in parts]
+        slot_width = max(width for _, width in divisions.values())
+        group_plans.append(GroupPlan(group, ready_programs, max_chunk_runs, slot_width, stages))
     return group_plans, division
+
+
+def _split_seeds(group: Group, name: str) -> dict[str, Group]:
+    """Returns a group with the seeds of one stage at a time, by names of their own."""
+    parts = {}
+    for start, end in itertools.pairwise([0, *look_seeds(group.config.num_seeds)]):
+        config = dataclasses.replace(group.config, seeds=f"{start}:{end}", num_seeds=end - start)
+        parts[f"{name}-{len(parts)}"] = group._replace(config=config)
+    return parts
 
 
 def make_groups(design: Design) -> list[Group]:

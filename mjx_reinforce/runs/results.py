@@ -211,6 +211,7 @@ def sweep(
     output: Path | str | None = None,
     exact: bool = False,
     chunk_runs: int | None = None,
+    until_decided: bool = False,
     report: bool = True,
     quiet: bool = False,
 ) -> SweepResults:
@@ -222,6 +223,8 @@ def sweep(
       output: the directory of the sweep's files. None, with ``base.output`` None too, leaves none.
       exact: train one run at a time, so that no bit of a result depends on the other runs.
       chunk_runs: most runs that train at the same time; by default as many as fit in memory.
+      until_decided: train fewer seeds if one configuration is surely the best before, see
+        ``statistics.sequential``; what it found is "decision" in sweep.json.
       report: write report.html among the files.
       quiet: show no progress.
 
@@ -253,7 +256,13 @@ def sweep(
         if folder is None:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sweep-")))
         base = dataclasses.replace(base, output=folder)
-        design = Design(base=base, over=over, exact=exact, chunk_runs=chunk_runs)
+        design = Design(
+            base=base,
+            over=over,
+            exact=exact,
+            chunk_runs=chunk_runs,
+            until_decided=until_decided,
+        )
         outcome = perform(design, Interrupt(), quiet=quiet)
         report_on(outcome, report=report and directory is not None)
         return read_results(folder)._replace(directory=directory)

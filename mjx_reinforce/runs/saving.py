@@ -9,9 +9,10 @@ is written again.
 import dataclasses
 import datetime
 import functools
+import itertools
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ from mjx_reinforce.runs.plan import GroupPlan, Plan
 from mjx_reinforce.runs.sinks import Sink, open_sinks
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup.provenance import provenance
+from mjx_reinforce.statistics.sequential import Verdict, look_seeds, sequential_test
 from mjx_reinforce.training import resume
 from mjx_reinforce.training.driver import Driver, DriverT, Evaluation, Observer, RunDriver, Runs
 from mjx_reinforce.training.record import header, lines
@@ -90,6 +92,14 @@ class Files(Observer[DriverT]):
     def has(self, chunk: str) -> bool:
         """Returns whether the runs of this name have ended."""
         return False
+
+    def stages(self) -> Iterator[list[GroupPlan]]:
+        """Yields the groups with the chunks of each stage, once those before have ended."""
+        yield self._plan.group_plans
+
+    def outcome(self) -> dict[str, Any]:
+        """Returns what the last file says beside what is said of every run and sweep."""
+        return {}
 
     def updated(self, driver: DriverT, num_nonfinite: np.ndarray) -> None:
         """Saves if that is due; the last block is saved with its evaluation, by ``ended``."""
@@ -352,7 +362,7 @@ class SweepFiles(Files[Driver]):
         # The folders in parts/ are those of chunks' checkpoints.
         remove_leftovers(*self._parts.glob("*/"))
         # Before anything is trained: they are joined when all is.
-        for group_plan in self._plan.group_plans:
+        for group_plan in itertools.chain.from_iterable(self.stages()):
             for runs in group_plan.chunks:
                 if self.has(runs.name):
                     _check_part(self._parts / f"{runs.name}.npz", runs, group_plan.ready.policy)
@@ -360,6 +370,45 @@ class SweepFiles(Files[Driver]):
     def has(self, chunk: str) -> bool:
         """Returns whether the runs of a chunk have ended."""
         return (self._parts / f"{chunk}.npz").exists()
+
+    def stages(self) -> Iterator[list[GroupPlan]]:
+        """Yields the groups with the chunks of each stage, once those before have ended.
+
+        In a sweep until the best is decided, a later stage has the contenders alone, and none
+        follows the one that decides.
+        """
+        if not self._plan.design.until_decided:
+            yield from super().stages()
+            return
+        for stage, _ in enumerate(look_seeds(self._plan.design.base.num_seeds)):
+            contenders = self._verdict(stage).contenders
+            if len(contenders) == 1:
+                return
+            yield [_of_contenders(x, stage, contenders) for x in self._plan.group_plans]
+
+    def outcome(self) -> dict[str, Any]:
+        """Returns which configuration is the best, or which may be, where a sweep looks at that."""
+        if not self._plan.design.until_decided:
+            return {}
+        return {"decision": self._verdict()._asdict()}
+
+    def _verdict(self, num_looks: int | None = None) -> Verdict:
+        """Returns what so many looks at the parts say of the configurations; all by default."""
+        design = self._plan.design
+        budget = design.base.num_seeds
+        # A seed that is not there yet ends the returns of its configuration.
+        returns = np.zeros((design.count(), budget))
+        is_there = np.zeros((design.count(), budget + 1), bool)
+        for path in self._parts.glob("*.npz"):
+            part = read_arrays(path, ("configuration", "seed", "eval_return"))
+            with naming_damage(path):
+                runs = part["configuration"], part["seed"]
+                returns[runs] = part["eval_return"][-1]
+                is_there[runs] = True
+        num_seeds = np.argmin(is_there, axis=1)
+        if num_looks is not None:
+            num_seeds = np.minimum(num_seeds, [0, *look_seeds(budget)][num_looks])
+        return sequential_test([x[:n] for x, n in zip(returns, num_seeds, strict=True)], budget)
 
     def began(self, driver: Driver) -> None:
         """Takes a chunk to its newest checkpoint, if there is one."""
@@ -390,8 +439,10 @@ class SweepFiles(Files[Driver]):
         if summary["status"] == "finished":
             # What a kill at this point left is written again, as a whole.
             shutil.rmtree(self._directory / "policies", ignore_errors=True)
-            for group_plan in self._plan.group_plans:
-                self._write_policies(group_plan, [parts[runs.name] for runs in group_plan.chunks])
+            # The chunks of a group, stage by stage.
+            for group_plans in zip(*self.stages(), strict=True):
+                chunks = [runs for group_plan in group_plans for runs in group_plan.chunks]
+                self._write_policies(group_plans[0], [parts[runs.name] for runs in chunks])
         # Before the parts go: they can make all the files again until this says that it is over.
         self._write_json("sweep.json", summary)
         if summary["status"] == "finished":
@@ -456,6 +507,17 @@ class SweepFiles(Files[Driver]):
                 settings["env_set"] = list(config.env_set)
             settings["seeds"] = seeds.tolist()
             write_json(policy_folder / "config.json", settings)
+
+
+def _of_contenders(group_plan: GroupPlan, stage: int, contenders: Sequence[int]) -> GroupPlan:
+    """Returns a group with the chunks of a stage, in which only contenders have runs."""
+    chunks = []
+    for runs in group_plan.stages[stage]:
+        is_run = np.isin(runs.configuration, contenders)
+        if is_run.any():
+            columns = (runs.member, runs.configuration, runs.seed)
+            chunks.append(Runs(runs.name, *(column[is_run] for column in columns)))
+    return group_plan._replace(stages=[chunks])
 
 
 def _check_part(path: Path, runs: Runs, policy: dict[str, Any]) -> None:

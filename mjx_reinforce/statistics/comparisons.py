@@ -186,12 +186,17 @@ def least_p(first: int, second: int) -> float:
     return 2 / math.comb(first + second, first)
 
 
-def compare_all(values: Sequence[np.ndarray], confidence: float = 0.95) -> list[Comparison]:
+def compare_all(
+    values: Sequence[np.ndarray],
+    seeds: Sequence[np.ndarray] | None = None,
+    confidence: float = 0.95,
+) -> list[Comparison]:
     """Compares every pair of configurations, p values corrected after Holm.
 
     Args:
-      values: [S] of each configuration, the same seeds in the same order; an entry that is not
-        finite is of a seed that failed.
+      values: [S] of each configuration; an entry that is not finite is of a seed that failed.
+      seeds: [S] of each configuration the numbers of its seeds, ascending: a pair is compared on
+        those that both have. By default all have the same seeds.
       confidence: the level of each interval (which is not corrected).
 
     Examples:
@@ -202,18 +207,26 @@ def compare_all(values: Sequence[np.ndarray], confidence: float = 0.95) -> list[
       3
     """
     pairs = list(itertools.combinations(range(len(values)), 2))
-    differences = [paired_difference(values[i], values[j], confidence=confidence) for i, j in pairs]
+    shared = [(values[i], values[j]) for i, j in pairs]
+    if seeds is not None:
+        shared = [
+            (values[i][np.isin(seeds[i], seeds[j])], values[j][np.isin(seeds[j], seeds[i])])
+            for i, j in pairs
+        ]
+    differences = [paired_difference(*pair, confidence=confidence) for pair in shared]
     holm_p_values = holm([difference.p_value for difference in differences])
     return [
         Comparison(
             i,
             j,
-            probability_of_improvement(values[i], values[j], paired=True, confidence=confidence),
+            probability_of_improvement(*pair, paired=True, confidence=confidence),
             Estimate(difference.value, difference.low, difference.high),
             difference.p_value,
             float(holm_p_value),
         )
-        for (i, j), difference, holm_p_value in zip(pairs, differences, holm_p_values, strict=True)
+        for (i, j), pair, difference, holm_p_value in zip(
+            pairs, shared, differences, holm_p_values, strict=True
+        )
     ]
 
 

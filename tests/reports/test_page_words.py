@@ -126,3 +126,71 @@ def test_what_is_solved_is_said_where_it_is_counted(tmp_path):
     page = page_of(directory)
     assert "Solved: a return of 3,800.0, the threshold of Hopper-v5, or more." in visible(page)
     assert "(no interval below six seeds)" in visible(page)
+
+
+def test_the_page_says_when_a_sweep_stopped_and_why(tmp_path):
+    """The excluded come last, also with a higher mean on their fewer seeds."""
+    decision = {
+        "contenders": [1],
+        "num_seeds": [8, 16, 16],
+        "looks": [8, 16],
+        "budget": 64,
+        "is_over": True,
+    }
+    over = {"learning_rate": [1e-3, 3e-3, 1e-2]}
+    directory = make_sweep(tmp_path / "sweep", num_seeds=16, over=over, decision=decision)
+
+    def change(arrays):
+        is_kept = (arrays["configuration"] > 0) | (arrays["seed"] < 8)
+        for name, array in arrays.items():
+            arrays[name] = array[..., is_kept]
+        for member, mean in enumerate((900, 800, 300)):
+            is_own = arrays["configuration"] == member
+            arrays["eval_return"][-1, is_own] = mean + arrays["seed"][is_own]
+
+    change_curves(directory, change)
+    findings = findings_of(directory)
+    assert findings.order == [1, 0, 2]
+    said = visible(page_of(directory))
+    assert "stopped after 16 of at most 64 seeds: learning rate 0.003 is surely the best." in said
+    excluded = "Surely below another: learning rate 0.001 after 8 seeds, learning rate 0.01 after"
+    assert f"{excluded} 16 seeds (sequential test, 2 looks;" in said
+    assert "The returns decided how many seeds there are" in said
+    # Of the seeds that both have, also where a third has fewer.
+    seeds = [findings.results[pair.first].configuration.seed for pair in findings.comparisons]
+    assert len(findings.comparisons) == 3
+    assert max(map(len, seeds)) == 16
+
+    open_decision = decision | {"contenders": [1, 2], "looks": [8], "is_over": False}
+    make_sweep(tmp_path / "open", num_seeds=16, over=over, decision=open_decision)
+    said = visible(page_of(tmp_path / "open"))
+    assert "has not decided yet, after 8 of at most 64 seeds." in said
+    assert "Any of these may be the best: learning rate 0.003, learning rate 0.01." in said
+
+
+def test_a_decision_about_other_configurations_is_damage(tmp_path):
+    decision = {"contenders": [0], "num_seeds": [8], "looks": [8], "budget": 64, "is_over": True}
+    directory = make_sweep(tmp_path / "sweep", over=ONE, decision=decision)
+    with pytest.raises(ValueError, match=r"sweep.json is damaged.*not about 2 configurations"):
+        findings_of(directory)
+
+
+def test_reliability_by_hand(tmp_path):
+    """Of 40 seeds the lowest is the bound, and a drop is from the highest evaluation."""
+    directory = make_sweep(tmp_path / "sweep", num_seeds=40, over=ONE)
+
+    def change(arrays):
+        arrays["eval_return"][:] = 100.0
+        arrays["eval_return"][0] = 0.0
+        arrays["eval_return"][-1] = 60.0 + arrays["seed"]
+        arrays["eval_return"][-1, arrays["configuration"] == 1] /= 2
+
+    change_curves(directory, change)
+    findings = findings_of(directory)
+    assert [result.floor for result in findings.results] == [60, 30]
+    assert findings.results[0].drops.tolist() == [100 - (60 + seed) for seed in range(40)]
+    said = visible(page_of(directory))
+    assert re.search(r"90% of runs return at least drop after the peak .* 60\.0 20\.5", said)
+    # The means are 79.5 and half of that, from 0: one by lot has three quarters.
+    assert "one drawn by lot lacks 25% of the best's gain" in said
+    assert "needs 29 seeds" in visible(page_of(make_sweep(tmp_path / "few", num_seeds=12)))

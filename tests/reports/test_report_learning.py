@@ -94,7 +94,7 @@ def test_every_figure_is_a_vector_and_every_table_has_a_number(crossed):
         assert "var(--" not in svg
     assert {path.suffix for path in beside.iterdir()} == {".png", ".svg", ".csv"}
     numbers = re.findall(r"Table (\d)\.", visible(crossed[0] / "report.html"))
-    assert numbers == ["1", "2", "3", "4"]
+    assert numbers == ["1", "2", "3", "4", "5"]
 
 
 def test_a_run_is_told_in_plain_words(tmp_path):

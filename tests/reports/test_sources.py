@@ -138,7 +138,7 @@ def test_what_cannot_be_compared_is_refused(tmp_path):
     (tmp_path / "empty").mkdir()
     run, sweep = make_measured_run(tmp_path / "run"), make_sweep(tmp_path / "sweep", over=ONE)
     for directories, said in (
-        ([run, sweep], "different tasks .*examples/all_tasks.py"),
+        ([run, sweep], "different tasks .*mjx_reinforce.report"),
         ([tmp_path / "empty"], "neither a run nor a sweep"),
         ([tmp_path / "none"], "there is no directory"),
         ([], "nothing to report on"),
