@@ -145,9 +145,19 @@ def replaced(episode: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in episode.items() if name in RANDOM}
 
 
-def make_data(model: "mjx.Model") -> mjx.Data:
-    """Returns MJX's simulation of a model at its start, on this process's own device."""
-    return contacts.make_data(model, jax.local_devices()[0])
+def make_data(model: MjModel) -> mjx.Data:
+    """Returns MJX's simulation of a model at its start, on this process's own device.
+
+    It has no room for contacts if MJX cannot find those of some pairs of geoms. Device code has
+    room of its own.
+    """
+    device = jax.local_devices()[0]
+    try:
+        return contacts.make_data(model, device)
+    except (NotImplementedError, ValueError):  # as MJX says that it has no such function
+        idle_model: Any = copy.copy(model)
+        idle_model.opt.disableflags |= _C.mjtDisableBit.mjDSBL_CONTACT
+        return contacts.make_data(_without_idle_pairs(idle_model), device)
 
 
 def has_data(model: MjModel) -> bool:
@@ -177,7 +187,7 @@ def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
         device = jax.local_devices()[0]
         mjx_model = mjx.put_model(_without_idle_pairs(model), impl="jax", device=device)
         # Notices what the model alone does not show; its arrays are not made.
-        jax.eval_shape(lambda: make_data(model))
+        jax.eval_shape(lambda: contacts.make_data(model, device))
     except Exception as error:  # of another library: no refusal
         raise BadEnvironmentError(f"converting {name} to MJX fails: {explain(error)}") from error
     return mjx_model

@@ -293,9 +293,13 @@ def _by_teams(
     with base.keeping_whole():
         try:
             program, shapes = scalarized.trace(function, *examples)
-            # A kernel has the tables of one model. A function that simulates none, or another one,
-            # is played by a thread an episode, which computes the physics as it was traced.
-            if model is None or {*scalar.simulated_models(program)} != {model.digest}:
+            # A kernel has the tables of one model. A function that simulates another one is played by
+            # a thread an episode, which computes the physics as it was traced; so is one that
+            # simulates none, unless a thread cannot trace this environment's.
+            simulated = {*scalar.simulated_models(program)}
+            if model is None or not simulated <= {model.digest}:
+                return None
+            if not simulated and c_mujoco.why_best(env) is None:
                 return None
             physics = team.team_physics(model)
             source = f"{jaxprs.fingerprint(program)} {physics} {objects.source_digest(*_WRITERS)}"
