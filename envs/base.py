@@ -551,7 +551,9 @@ class MujocoEnv(Env):
 
     def _is_played_by_c(self) -> bool:
         """Returns whether neither MJX nor the device code that asks simulates this model."""
-        return self.refusal is not None and not (is_kept_whole() and self._has_device_code)
+        # What settles is no part of the device code.
+        has_kernel = is_kept_whole() and not self.settle_steps and self._has_device_code
+        return self.refusal is not None and not has_kernel
 
     @functools.cached_property
     def _has_device_code(self) -> bool:

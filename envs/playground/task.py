@@ -255,6 +255,31 @@ class PlaygroundEnv(MujocoEnv):
         """Returns the controls [nu] that the task's ``step`` applies."""
         return self._applied(before.memory, action).control
 
+    def control(self, action: jax.Array) -> jax.Array:
+        """Returns the controls [nu] that an action applies, whatever the episode was so far.
+
+        Raises:
+          ValueError: they depend on more than the action.
+        """
+        # In the precision in which MJX has the model; exports ask in float64.
+        with jax.enable_x64(self.model.body_mass.dtype == jnp.float64):
+            shapes = jax.eval_shape(self.reset, jax.random.key(0)).pipeline_state.memory
+        # What is not known shows in the controls, if they depend on it.
+        memory = {
+            name: jnp.full(
+                x.shape, jnp.nan if jnp.issubdtype(x.dtype, jnp.floating) else 0, x.dtype
+            )
+            for name, x in shapes.items()
+        }
+        control = self._applied(memory, action).control
+        name = type(self.task).__name__
+        require(
+            bool(jnp.all(jnp.isfinite(control))),
+            f"the controls of {name} depend on more than the action; leave --env out, and compute "
+            "ctrl as its step does",
+        )
+        return control
+
     @property
     def has_pushes(self) -> bool:
         """Whether the task sets velocities before its physics."""

@@ -3,9 +3,9 @@
 Episodes begin where the task's own ``reset`` has them begin, and the same random actions are
 applied. After some env steps the positions and velocities are compared, each error divided by the
 number where that is above 1. A file of the suite allows its solver few iterations, so that each
-solver ends elsewhere: in the last column ours and MJX's run to the optimum.
+solver ends elsewhere: where ours and MJX's differ, they also run to the optimum.
 
-Speed is that of env steps without resets, of both in turn, in float32.
+Env steps a second are those of the same programs, without resets, of all in turn.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ import tyro
 from mujoco import mjx  # pyright: ignore[reportAttributeAccessIssue] (a C extension)
 
 from experiments.kit import markdown
-from mjx_reinforce import envs, make_vec
+from mjx_reinforce import envs
 from mjx_reinforce.engine.play.counter import key_of_words
 from mjx_reinforce.engine.play.program import machine_map
 from mjx_reinforce.engine.team import supported
@@ -43,135 +43,123 @@ class Settings:
 
     tasks: tuple[str, ...] = TASKS
     """Names of Playground's registry."""
-    what: Literal["parity", "speed", "engines"] = "parity"
-    """The errors; env steps a second; or what plays each task."""
+    what: Literal["steps", "engines"] = "steps"
+    """Errors and env steps a second, or what plays each task."""
     float64: bool = False
     """Whether JAX computes in float64."""
-    episodes: int = 32
-    """Episodes of a comparison."""
+    episodes: int = 256
+    """Episodes at once."""
     steps: int = 5
-    """Env steps of a comparison."""
-    batch: int = 256
-    """Environments at once where speed is measured."""
+    """Env steps after which episodes are compared."""
+    timed_steps: int = 20
+    """Env steps of a program that is timed."""
     rounds: int = 3
     """How often speed is measured; the median counts."""
 
 
-def _moved(
-    reset: Callable[..., Any], step: Callable[..., Any], read: Callable[..., Any], actions: Any
-) -> np.ndarray:
-    """Returns positions and velocities [N, nq + nv] after env steps.
+class Side:
+    """Something that plays a task.
 
-    Args:
-      reset: (words of keys [N, 2]) -> states.
-      step: (states, actions [N, A]) -> states.
-      read: state -> what has ``qpos`` and ``qvel``.
-      actions: [T, N, A].
+    advance: () -> positions and velocities after each env step [T, N, nq + nv], compiled
     """
-    words = jax.random.key_data(jax.random.split(jax.random.key(0), actions.shape[1]))
-    state = reset(words)
-    for action in actions:
-        state = step(state, action)
-    data = read(state)
-    return np.concatenate([data.qpos, data.qvel], axis=1).astype(float)
+
+    def __init__(
+        self, reset: Callable[..., Any], step: Callable[..., Any], place: str, settings: Settings
+    ):
+        """Compiles a program.
+
+        Args:
+          reset: (words of keys [N, 2]) -> states.
+          step: (states, actions [N, A]) -> states.
+          place: the field of a state that has ``qpos`` and ``qvel``.
+          settings: how many episodes and steps.
+        """
+        words = jax.random.key_data(jax.random.split(jax.random.key(0), settings.episodes))
+        # A start is made once: XLA need not make it fast, which takes it a minute.
+        start = jax.jit(reset).lower(words).compile({"xla_backend_optimization_level": 0})(words)
+
+        def play(start: Any, actions: jax.Array) -> jax.Array:
+            """Returns what is compared after each env step."""
+
+            def advance(state: Any, action: jax.Array) -> Any:
+                state = step(state, action)
+                data = getattr(state, place)
+                return state, jnp.concatenate([data.qpos, data.qvel], axis=1)
+
+            return jax.lax.scan(advance, start, actions)[1]
+
+        self._play = jax.jit(play)
+        self._start = start
+
+    def advance(self, actions: jax.Array) -> np.ndarray:
+        """Returns positions and velocities after each env step, [T, N, nq + nv]."""
+        return np.asarray(self._play(self._start, actions), float)
+
+
+def _sides(env: Any, settings: Settings, others: dict[str, Any]) -> dict[str, Side]:
+    """Returns machine code, and others that play the task, each with their name."""
+    start = jax.eval_shape(lambda: env.reset(jax.random.key(0)))
+
+    def begin(task: Any) -> Callable[..., Any]:
+        return lambda words: task.reset(key_of_words(words))
+
+    words = jax.ShapeDtypeStruct((2,), np.uint32)
+    action = jnp.zeros(env.action_size)
+    reset = machine_map(begin(env), words, env=env)
+    step = machine_map(env.step, start, action, env=env)
+    sides = {"ours": Side(reset, step, "pipeline_state", settings)}
+    for name, task in others.items():
+        place = "data" if name == "mjx" else "pipeline_state"
+        sides[name] = Side(jax.vmap(begin(task)), jax.vmap(task.step), place, settings)
+    return sides
 
 
 def _error(x: np.ndarray, y: np.ndarray) -> float:
     return float(np.max(np.abs(x - y) / np.maximum(1, np.abs(y))))
 
 
-def _ends(env: Any, settings: Settings, others: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Returns where episodes are by machine code, and by others, each with their name."""
-    shape = (settings.steps, settings.episodes, env.action_size)
-    actions = jax.random.uniform(jax.random.key(1), shape, minval=-1, maxval=1)
-    words = jax.ShapeDtypeStruct((2,), np.uint32)
-    start = jax.eval_shape(lambda: env.reset(jax.random.key(0)))
-
-    def begin(reset: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda words: reset(key_of_words(words))
-
-    ours = (
-        machine_map(begin(env.reset), words, env=env),
-        machine_map(env.step, start, actions[0, 0], env=env),
-    )
-    mapped = {
-        name: (jax.vmap(begin(task.reset)), jax.vmap(task.step)) for name, task in others.items()
-    }
-    ends = {}
-    for name, (reset, step) in {"ours": ours, **mapped}.items():
-        place = "data" if name == "mjx" else "pipeline_state"
-        read = _reader(place)
-        ends[name] = _moved(jax.jit(reset), jax.jit(step), read, actions)
-    return ends
+def _actions(env: Any, settings: Settings) -> jax.Array:
+    shape = (settings.timed_steps, settings.episodes, env.action_size)
+    return jax.random.uniform(jax.random.key(1), shape, minval=-1, maxval=1)
 
 
-def _reader(place: str) -> Callable[[Any], Any]:
-    return lambda state: getattr(state, place)
-
-
-def parity(settings: Settings) -> None:
-    """Prints the errors of each task."""
+def steps(settings: Settings) -> None:
+    """Prints the errors of each task, and env steps a second."""
     header = ["task", "ours, MJX", "ours, C", "MJX, C", "to the optimum: ours, MJX"]
     rows = []
     for name in settings.tasks:
         env: Any = envs.from_playground(name)
-        ends = _ends(env, settings, {"mjx": env.task, "c": env.in_c_mujoco()})
+        sides = _sides(env, settings, {"mjx": env.task, "c": env.in_c_mujoco()})
+        actions = _actions(env, settings)
+        last = settings.steps - 1
+        ends = {side: x.advance(actions)[last] for side, x in sides.items()}
         pairs = [("ours", "mjx"), ("ours", "c"), ("mjx", "c")]
         errors = [_error(ends[x], ends[y]) for x, y in pairs]
+        rates = _rates(sides, actions, settings.rounds)
         row = [name, *(f"{error:.0e}" for error in errors), ""]
         if errors[0] > _EQUAL:
             for option, count in _ITERATIONS.items():
                 setattr(env.task.mj_model.opt, option, count)
             env.task._mjx_model = mjx.put_model(env.task.mj_model, impl="jax")
-            ends = _ends(envs.from_playground(env.task), settings, {"mjx": env.task})
-            row[-1] = f"{_error(ends['ours'], ends['mjx']):.0e}"
-        rows.append(row)
-        print(*rows[-1], file=sys.stderr, flush=True)
-    print(markdown.table(header, rows))
+            exact = _sides(envs.from_playground(env.task), settings, {"mjx": env.task})
+            ours, theirs = (exact[side].advance(actions)[last] for side in ("ours", "mjx"))
+            row[-1] = f"{_error(ours, theirs):.0e}"
+        row += [f"{rates[side]:,.0f}" for side in sides]
+        rows.append([*row, f"{rates['ours'] / rates['mjx']:.1f}"])
+        print(*rows[-1], sep="|", file=sys.stderr, flush=True)
+    print(markdown.table([*header, "ours/s", "MJX/s", "C/s", "ours/MJX"], rows))
 
 
-def _rate(advance: Callable[[Any], Any], state: Any, count: int) -> float:
-    """Returns env steps a second of a compiled function that makes so many."""
-    begin = time.perf_counter()
-    jax.block_until_ready(advance(state))
-    return count / (time.perf_counter() - begin)
-
-
-def speed(settings: Settings) -> None:
-    """Prints env steps a second of each task."""
-    rows = []
-    for name in settings.tasks:
-        env: Any = envs.from_playground(name)
-        num_steps = 20
-        shape = (num_steps, settings.batch, env.action_size)
-        actions = jax.random.uniform(jax.random.key(1), shape, minval=-1, maxval=1)
-        vec = make_vec(env, settings.batch, engine="native", autoreset="disabled")
-        keys = jax.random.split(jax.random.key(0), settings.batch)
-        sides = {
-            "ours": (vec.step, vec.reset(jax.random.key(0))),
-            "mjx": (jax.vmap(env.task.step), jax.jit(jax.vmap(env.task.reset))(keys)),
-        }
-        rates: dict[str, list[float]] = {}
-        programs = {side: _program(step, actions) for side, (step, _) in sides.items()}
-        for measured in range(-1, settings.rounds):
-            for side, (_, state) in sides.items():
-                rate = _rate(programs[side], state, num_steps * settings.batch)
-                if measured >= 0:  # the first one compiles
-                    rates.setdefault(side, []).append(rate)
-        ours, theirs = (float(np.median(rates[side])) for side in ("ours", "mjx"))
-        rows.append([name, f"{ours:,.0f}", f"{theirs:,.0f}", f"{ours / theirs:.0f}"])
-        print(*rows[-1], file=sys.stderr, flush=True)
-    print(markdown.table(["task", "ours", "MJX", "ratio"], rows))
-
-
-def _program(step: Callable[..., Any], actions: jax.Array) -> Callable[[Any], Any]:
-    """Returns a compiled function that makes the env steps of all actions [T, N, A]."""
-
-    @jax.jit
-    def advance(state: Any) -> Any:
-        return jax.lax.scan(lambda x, action: (step(x, action), None), state, actions)[0]
-
-    return advance
+def _rates(sides: dict[str, Side], actions: jax.Array, rounds: int) -> dict[str, float]:
+    """Returns env steps a second of programs that are compiled, the medians of all rounds."""
+    seconds: dict[str, list[float]] = {side: [] for side in sides}
+    for _ in range(rounds):
+        for side, program in sides.items():
+            begin = time.perf_counter()
+            program.advance(actions)
+            seconds[side].append(time.perf_counter() - begin)
+    count = actions.shape[0] * actions.shape[1]
+    return {side: count / float(np.median(times)) for side, times in seconds.items()}
 
 
 def engines(settings: Settings) -> None:
@@ -194,7 +182,7 @@ def engines(settings: Settings) -> None:
 def main(settings: Settings) -> None:
     """Compares, and prints a table."""
     jax.config.update("jax_enable_x64", settings.float64)
-    {"parity": parity, "speed": speed, "engines": engines}[settings.what](settings)
+    {"steps": steps, "engines": engines}[settings.what](settings)
 
 
 if __name__ == "__main__":

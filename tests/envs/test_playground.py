@@ -15,6 +15,7 @@ from places import PYTHONPATH
 from mjx_reinforce import envs, make_vec
 from mjx_reinforce.engine import contract
 from mjx_reinforce.envs.in_mujoco import InMujoco
+from mjx_reinforce.export.control import affine_control
 
 package = pytest.importorskip("mujoco_playground")
 from ml_collections import config_dict  # noqa: E402
@@ -200,6 +201,14 @@ def test_importing_this_package_imports_no_playground():
         command, env=os.environ | {"PYTHONPATH": PYTHONPATH}, capture_output=True, text=True
     )
     assert done.stdout.split() == ["False"]
+
+
+def test_exports_have_controls_that_depend_on_the_action_alone():
+    """And refuse others, which a robot could not compute without the task."""
+    numbers = affine_control(envs.make("playground:PendulumSwingup"))
+    assert (numbers["home"], numbers["scale"]) == (0, 1)
+    with pytest.raises(ValueError, match="the controls of Cart depend on more than the action"):
+        affine_control(envs.from_playground(Cart()))
 
 
 class Twice(Cart):
