@@ -42,7 +42,8 @@ def load(name: str, **overrides: object) -> PlaygroundEnv:
     config = registry.get_default_config(name)
     for entry in overrides:
         check_name(f"entry of the configuration of {name}", entry, config)
-    return PlaygroundEnv(registry.load(name, config_overrides={"impl": "jax"} | overrides))
+    implementation = {"impl": "jax"} if "impl" in config else {}
+    return PlaygroundEnv(registry.load(name, config_overrides=implementation | overrides))
 
 
 def _registry(name: str) -> Any:

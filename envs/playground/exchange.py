@@ -75,15 +75,16 @@ class TaskData:
         return cls(children[0], source)
 
 
-class _Unknown:
-    """A simulation that the engine will compute: a start cannot depend on it, and would be NaN."""
+class _Constant:
+    """A simulation of which every number is the same."""
 
-    def __init__(self, model: MjModel):
+    def __init__(self, model: MjModel, number: float):
         self._data = _C.MjData(model)
+        self._number = number
 
     def __getattr__(self, name: str) -> jax.Array:
         spec = spec_of(self._data, name)
-        return jnp.full(spec.shape, jnp.nan if np.issubdtype(spec.dtype, np.floating) else 0)
+        return jnp.full(spec.shape, self._number if np.issubdtype(spec.dtype, np.floating) else 0)
 
 
 class _Forwarded:
@@ -132,7 +133,8 @@ class Start:
             for name, x in fields.items()
             if name in shapes and x is not None
         }
-        return TaskData(_at_start(self._model) | arrays)
+        # Without a forward pass, MJX's simulation has zeros.
+        return TaskData(_at_start(self._model) | arrays, _Constant(self._model, 0.0))
 
     def forward(self, model: Any, data: TaskData) -> TaskData:
         """Stands for ``mjx.forward``."""
@@ -154,7 +156,8 @@ class Start:
         if self._data is not None and self.calls >= self._last_call:
             return TaskData({}, self._data)
         if self.settle_steps:
-            return TaskData({}, _Unknown(self._model))
+            # The engine will compute it: a start that depended on it would be NaN.
+            return TaskData({}, _Constant(self._model, jnp.nan))
         return TaskData(self.fields, _Forwarded(functools.partial(self._forward, self.fields)))
 
 

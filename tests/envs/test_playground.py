@@ -180,6 +180,29 @@ def test_one_episode_in_c_settles_too():
     assert one.data.time == 0
 
 
+class Unforwarded(Cart):
+    """Its reset reads a simulation without a forward pass, as Playground's arms do."""
+
+    def reset(self, rng):
+        data = mjx_env.make_data(self.mj_model, qpos=jax.random.uniform(rng, (2,)), impl="jax")
+        obs = jnp.append(data.site_xpos[0], data.qpos)
+        zero = jnp.zeros(())
+        return mjx_env.State(data, obs, zero, zero, {}, {})
+
+    def step(self, state, action):
+        data = mjx_env.step(self.mjx_model, state.data, action, self.n_substeps)
+        obs = jnp.append(data.site_xpos[0], data.qpos)
+        return state.replace(data=data, obs=obs, reward=data.qpos[0])
+
+
+def test_a_reset_without_a_forward_pass_sees_zeros():
+    task = Unforwarded()
+    key = jax.random.key(1)
+    for env in (task, envs.from_playground(task).in_c_mujoco()):
+        np.testing.assert_array_equal(env.reset(key).obs[:3], 0)
+        np.testing.assert_allclose(env.reset(key).obs[3:], jax.random.uniform(key, (2,)))
+
+
 def test_the_exchange_is_undone():
     functions = [getattr(place, name) for place, name in FUNCTIONS]
     env = envs.from_playground(Cart())
