@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 silence_mjx()  # before any environment imports it
 
 _TASKS = "mjx_reinforce.envs.tasks"
+#: What stands before the name of a task of MuJoCo Playground.
+_PLAYGROUND = "playground:"
 #: id -> ("module:Class" or a callable, constructor arguments). One line a task.
 _TABLE: dict[str, tuple[str | Callable[..., Any], dict[str, Any]]] = {
     "InvertedPendulum-v5": (f"{_TASKS}.pendulums:InvertedPendulum", {}),
@@ -61,7 +63,8 @@ def make(id: str, /, **kwargs: object) -> "MujocoEnv":
     """Builds an environment: a ``MujocoEnv``, except of the cart-poles and of classes of your own.
 
     Args:
-      id: one of ``names()``, or "module:Class" for one of your own, importable from here.
+      id: one of ``names()``, or "module:Class" for one of your own, importable from here, or
+        "playground:WalkerRun" for a task of MuJoCo Playground.
       **kwargs: arguments of the environment's class, over the table's.
 
     Raises:
@@ -83,11 +86,41 @@ def make(id: str, /, **kwargs: object) -> "MujocoEnv":
         raise
     except (Exception, SystemExit) as error:  # the user's code may raise anything
         # A ValueError of our tasks is a message for the user; from a class of one's own it is not.
-        if isinstance(error, ValueError) and ":" not in id:
+        is_message = ":" not in id or id.startswith(_PLAYGROUND)
+        if isinstance(error, ValueError) and is_message:
             raise
         raise ValueError(f"cannot build the environment {id!r}: {checks.explain(error)}") from error
     checks.check_parts(env)
     return env
+
+
+def from_playground(task: Any, /, **overrides: object) -> "MujocoEnv":
+    """Builds an environment from a task of MuJoCo Playground, with the physics of an engine here.
+
+    The task's own ``reset`` and ``step`` are traced, and their calls of Playground's physics are
+    exchanged meanwhile. ``make`` does the same for the id "playground:WalkerRun".
+
+    Args:
+      task: a name of Playground's registry, such as "WalkerRun", or an instance of its ``MjxEnv``,
+        also of a class of your own.
+      **overrides: entries of the task's configuration, of a name.
+
+    Raises:
+      ValueError: Playground is not installed, or has no such task; the task does what no engine
+        here can; or overrides are given for an instance.
+
+    Examples:
+      >>> from mjx_reinforce import envs
+      >>> env = envs.from_playground("CartpoleBalance")  # doctest: +SKIP
+      >>> env.observation_size, env.action_size  # doctest: +SKIP
+      (5, 1)
+    """
+    from mjx_reinforce.envs import playground
+
+    if isinstance(task, str):
+        return playground.load(task, **overrides)
+    checks.require(not overrides, f"{sorted(overrides)} are for a name; this task is made already")
+    return playground.PlaygroundEnv(task)
 
 
 def make_set(id: str, words: Sequence[str] = ()) -> Any:
@@ -154,7 +187,11 @@ def make_vec(
 
 
 def _import(id: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:
-    """Returns the class or function of an entry of the table, or of "module:Class"."""
+    """Returns the class or function of an entry of the table, or of an id with a colon."""
+    if id.startswith(_PLAYGROUND):
+        from mjx_reinforce.envs import playground
+
+        return playground.builder(id.removeprefix(_PLAYGROUND))
     if ":" in id:
         return load_own("environment", id, form="module:Class")
     return load_definition(entry)

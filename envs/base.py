@@ -115,6 +115,9 @@ class MujocoEnv(Env):
     #: How many observations a policy sees: the last ones, the oldest first, one after the other. At
     #: the start of an episode all are the first. A policy that runs elsewhere keeps them itself.
     frames: int = 1
+    #: Physics steps that an episode makes before it begins, under the controls of its start; its
+    #: time is then 0.
+    settle_steps: int = 0
     #: What ``actuate`` adds to the controls at each env step of a period [P, nu], if it does that:
     #: files of ``export --env`` add it, too. ``parts.gait`` makes one, ``parts.cyclic`` reads it.
     gait: np.ndarray | None = None
@@ -140,6 +143,7 @@ class MujocoEnv(Env):
             self._model = None
             self.refusal = str(error)
         self._start = jax.jit(prune(self._forward_state))
+        self._settled_start = jax.jit(prune(self._settled_state))
         # A range that is written without a limit counts for nothing in MuJoCo.
         low, high = np.array(self.mj_model.actuator_ctrlrange).T
         is_limited = np.array(self.mj_model.actuator_ctrllimited, bool)
@@ -264,7 +268,12 @@ class MujocoEnv(Env):
         """Returns the start of an episode; consumes the key."""
         memory_rng, rng = self.split_rng(rng)
         episode, start = self.draw(rng)
-        return self.set_state(**start, episode=episode, rng=memory_rng)
+        if not self.settle_steps:
+            return self.set_state(**start, episode=episode, rng=memory_rng)
+        if self._is_played_by_c():
+            return self._in_c_mujoco.settled(start, episode, memory_rng, jnp.array(True))
+        begin = self._settled_state if is_kept_whole() else self._settled_start
+        return begin(start, episode, memory_rng)
 
     @property
     def has_memory(self) -> bool:
@@ -410,13 +419,57 @@ class MujocoEnv(Env):
         else:
             forward, _ = self._physics_of(episode, constants)
             data = physics.like(forward(start_data).replace(qpos=qpos), start_data)
+        recollect = functools.partial(recollect_start, self, rng)
+        return self._state_at(data, start_data, episode, constants, _mocap(fields), recollect)
+
+    def _settled_state(
+        self,
+        start: dict[str, jax.Array],
+        episode: dict[str, jax.Array],
+        rng: jax.Array | None,
+    ) -> State:
+        """Returns the state after ``settle_steps`` physics steps from fields of a start."""
+        # A kernel of teams has the physics of env steps alone: what settles is always traced.
+        start_data = models.make_data(self.mj_model).replace(**start)
+        constants = derived.constants(self.mj_model, episode)
+        forward, physics_step = self._physics_of(episode, constants)
+        data = physics.like(forward(start_data), start_data)
+
+        def settle(_: int, data: mjx.Data) -> mjx.Data:
+            """Makes one physics step."""
+            return physics.like(physics_step(data), data)
+
+        data = jax.lax.fori_loop(0, self.settle_steps, settle, data)
+        data = data.replace(time=jnp.zeros_like(data.time))
+        recollect = functools.partial(recollect_start, self, rng)
+        return self._state_at(data, data, episode, constants, _mocap(start), recollect)
+
+    def _state_at(
+        self,
+        data: Any,
+        start_data: mjx.Data,
+        episode: dict[str, jax.Array],
+        constants: dict[str, jax.Array],
+        mocap: dict[str, jax.Array],
+        recollect: Callable[[View], Recollection],
+    ) -> State:
+        """Returns the state of an episode that begins with a simulation.
+
+        Args:
+          data: the simulation.
+          start_data: what no physics changes of it.
+          episode: what ``randomize`` returned.
+          constants: what MuJoCo derives from that.
+          mocap: the poses of mocap bodies that are not as the model has them.
+          recollect: returns what the episode remembers at its start.
+        """
+        dtype = start_data.qpos.dtype
         view = View(data, self.mj_model, episode)
-        recollection = recollect_start(self, rng, view)
-        state = self._physics(data, episode, constants, _mocap(fields), recollection)
+        state = self._physics(data, episode, constants, mocap, recollect(view))
         # No env step was made: the outcome says only which terms there are, each 0 so far. Wrappers
         # and loops need a state of one structure from the first step on.
-        zero = jnp.zeros((), qpos.dtype)
-        action = jnp.zeros(self.action_size, qpos.dtype)
+        zero = jnp.zeros((), dtype)
+        action = jnp.zeros(self.action_size, dtype)
         terms = self._outcome(self._before(state, start_data), view, action)[2]
         metrics = dict.fromkeys(terms, zero)
         return State(cast(Any, state), observed(self, view), zero, zero, metrics)
@@ -498,7 +551,9 @@ class MujocoEnv(Env):
 
     def _is_played_by_c(self) -> bool:
         """Returns whether neither MJX nor the device code that asks simulates this model."""
-        return self.refusal is not None and not (is_kept_whole() and self._has_device_code)
+        # What settles is no part of the device code.
+        has_kernel = is_kept_whole() and not self.settle_steps and self._has_device_code
+        return self.refusal is not None and not has_kernel
 
     @functools.cached_property
     def _has_device_code(self) -> bool:

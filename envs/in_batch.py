@@ -176,12 +176,17 @@ class Simulations:
         return _C.mj_stateSize(self.model, _C.mjtState.mjSTATE_INTEGRATION)
 
     def start(
-        self, names: Sequence[str], inputs: Sequence[np.ndarray], results: Sequence[np.ndarray]
+        self,
+        names: Sequence[str],
+        settle_steps: int,
+        inputs: Sequence[np.ndarray],
+        results: Sequence[np.ndarray],
     ) -> None:
         """Begins episodes: a forward pass at given positions, velocities and other fields.
 
         Args:
           names: of the fields that are not as the model has them.
+          settle_steps: physics steps before the time is 0.
           inputs: which episodes begin [B], those fields [B, ...], the randomized fields of the
             model [B, ...].
           results: state [B, S], sound [B] and the fields [B, ...], which are written; those of an
@@ -200,6 +205,10 @@ class Simulations:
             for name, values in zip(names, start_fields, strict=True):
                 batch.bind(name)[ids] = values[ids]
             failed = self._failed(batch, functools.partial(batch.forward, ids=ids))
+            if settle_steps:
+                settle = functools.partial(batch.step, ids=ids, nstep=settle_steps)
+                failed |= self._failed(batch, settle)
+                batch.bind("time")[ids] = 0
             self._write(batch, failed | (self._warnings(batch) > warnings), results)
 
     def step(
@@ -402,11 +411,12 @@ class InBatch(Env):
         jax.eval_shape(read, start_fields, self._episode, jnp.zeros(self.env.action_size))
         return sorted({*recorder.names, *models.CARRIED, *self._carried})
 
-    def _host_start(self, names: tuple[str, ...]) -> HostCall:
+    def _host_start(self, names: tuple[str, ...], settle_steps: int) -> HostCall:
         """Returns the operation that begins an episode, given fields of mjData by their names."""
-        start = functools.partial(self._simulations.start, names)
+        start = functools.partial(self._simulations.start, names, settle_steps)
         inputs = [self._specs[name] for name in names]
-        return self._host_call("start", names, start, [Spec((), bool), *inputs])
+        options = (names, settle_steps)
+        return self._host_call("start", options, start, [Spec((), bool), *inputs])
 
     def _host_step(self) -> HostCall:
         """Returns the operation that advances an episode."""
@@ -460,7 +470,7 @@ class InBatch(Env):
         # As many simulations begin as there are keys, also where nothing is drawn: the batch that
         # steps them is the one that knows which of their bodies sleep.
         words = jax.random.key_data(rng)
-        return self._start(start, episode, memory_rng, is_used & jnp.all(words == words))
+        return self.settled(start, episode, memory_rng, is_used & jnp.all(words == words))
 
     def set_state(
         self,
@@ -472,7 +482,24 @@ class InBatch(Env):
     ) -> State:
         """Returns the state at positions [nq] and velocities [nv], as ``MujocoEnv.set_state``."""
         start = {"qpos": qpos, "qvel": qvel, **fields}
-        return self._start(start, episode or {}, rng, jnp.array(True))
+        return self._start(start, episode or {}, rng, jnp.array(True), settle_steps=0)
+
+    def settled(
+        self,
+        start: dict[str, jax.Array],
+        episode: dict[str, jax.Array],
+        rng: jax.Array | None,
+        is_used: jax.Array,
+    ) -> State:
+        """Returns the state after the task's ``settle_steps`` from fields of mjData.
+
+        Args:
+          start: the fields.
+          episode: what ``randomize`` returned.
+          rng: the key of the episode's memory; consumed.
+          is_used: [] whether an episode begins; else what it returns means nothing.
+        """
+        return self._start(start, episode, rng, is_used, self.env.settle_steps)
 
     def _start(
         self,
@@ -480,10 +507,11 @@ class InBatch(Env):
         episode: dict[str, jax.Array],
         rng: jax.Array | None,
         is_used: jax.Array,
+        settle_steps: int,
     ) -> State:
         """Returns the state of an episode that starts with fields of mjData, where it is to []."""
         real = jnp.result_type(float)
-        begin = self._host_start(tuple(start))
+        begin = self._host_start(tuple(start), settle_steps)
         start_fields = [jnp.asarray(x, real) for x in start.values()]
         results = begin(is_used, *start_fields, *self._model_fields(episode))
         physics, view, _ = self._simulated(results, episode)

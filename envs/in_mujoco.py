@@ -91,6 +91,9 @@ class InMujoco:
         for name, field in start.items():
             getattr(data, name)[:] = field
         _C.mj_forward(model, data)
+        if self.env.settle_steps:
+            _C.mj_step(model, data, self.env.settle_steps)
+            data.time = 0
         self.data = data
         fields = self._fields()
         self._observation, self._recollection = self._observe(memory_rng, fields, self._episode)

@@ -26,7 +26,8 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PUBLIC = {name: getattr(mjx_reinforce, name) for name in mjx_reinforce.__all__}
 del PUBLIC["__version__"]
-TASKS = {f"envs.{name}": getattr(envs, name) for name in ("names", "make", "register")}
+TASK_NAMES = ("names", "make", "register", "from_playground")
+TASKS = {f"envs.{name}": getattr(envs, name) for name in TASK_NAMES}
 PARTS = {f"envs.parts.{name}": getattr(parts, name) for name in parts.__all__}
 #: Comment before a block that no test runs, with the reason.
 NOT_RUN = "<!-- not run: "

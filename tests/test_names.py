@@ -15,8 +15,8 @@ from sizes import package_files
 #: Placeholders of commands and formulas, and names of other programs that no file of ours has.
 OUTSIDE = """
     DIR ID NAME RUN RUN_OR_SWEEP VALUE sum_n sum_t seed_0
-    Acc EpisodeWrapper JaxprEqn Linear SummaryWriter Vel binomtest custom_vjp do_simulation nohup
-    np_random platform_dependent simple tip __future__ annotations
+    Acc EpisodeWrapper JaxprEqn Linear MjxEnv SummaryWriter Vel binomtest custom_vjp do_simulation
+    nohup np_random platform_dependent simple tip __future__ annotations
     """
 #: Functions and variables in the source of C MuJoCo, to which comments on our physics point.
 C_MUJOCO = """

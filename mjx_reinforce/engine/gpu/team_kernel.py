@@ -111,7 +111,7 @@ class _Carried:
     """What a step reads besides the actor, and what it hands on to the next step.
 
     A team has two copies of it: a step reads ``own`` and writes ``following``, so that no lane
-    reads what another one has written already. What never changes in an episode is ``lasting``.
+    reads what another one has written already. What never changes in an episode has one place.
 
     words: of 4 bytes of a copy
     lasting_words: of what never changes
@@ -144,6 +144,7 @@ class _Carried:
         self.begin += text.first_lines
 
     def _give_place(self, number: int, arguments: StepArguments, *, is_constant: bool) -> None:
+        """Adds the lines of an argument that an episode has."""
         leaf = arguments.leaves[number]
         words = -(-leaf.size * leaf.itemsize // 4)
         if is_constant:

@@ -103,11 +103,12 @@ def native_rollout(
 def _begin(env: Environment, program: NativeProgram, keys: jax.Array) -> tuple[Any, jax.Array]:
     """Returns the starts of episodes by their keys [N], and the keys [N] of their noise."""
     vmap_begin = jax.vmap(functools.partial(episode.begin, env))
-    if isinstance(program.code, machine.Code) or program.code.launch.lanes == 1:
+    is_for_one = isinstance(program.code, machine.Code) or program.code.launch.lanes == 1
+    if is_for_one and not _settles(env):
         return vmap_begin(keys)
 
     # Teams of lanes start a large model, too: in XLA's reset its sums would be atomic on a GPU, and
-    # their bits would differ from run to run.
+    # their bits would differ from run to run. A start that settles is as long as many env steps.
     def begin(words: jax.Array) -> tuple[Any, jax.Array]:
         state, noise_key = episode.begin(env, key_of_words(words))
         return state, jax.random.key_data(noise_key)
@@ -119,6 +120,13 @@ def _begin(env: Environment, program: NativeProgram, keys: jax.Array) -> tuple[A
         return vmap_begin(keys)
     state, noise_words = native_begin(words)
     return state, jax.random.wrap_key_data(noise_words)
+
+
+def _settles(env: Any) -> bool:
+    """Returns whether an environment makes physics steps before an episode begins."""
+    while hasattr(env, "env"):
+        env = env.env
+    return getattr(env, "settle_steps", 0) > 0
 
 
 def against_key(key: jax.Array) -> str | None:

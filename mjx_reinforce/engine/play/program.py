@@ -293,9 +293,9 @@ def _by_teams(
     with base.keeping_whole():
         try:
             program, shapes = scalarized.trace(function, *examples)
-            # A kernel has the tables of one model. A function that simulates another one is played by
-            # a thread an episode, which computes the physics as it was traced; so is one that
-            # simulates none, unless a thread cannot trace this environment's.
+            # A kernel has the tables of one model. A function that simulates another one is for a
+            # thread an episode, which computes the physics as it was traced. So is one that
+            # simulates none, unless only the device code has this environment's physics.
             simulated = {*scalar.simulated_models(program)}
             if model is None or not simulated <= {model.digest}:
                 return None

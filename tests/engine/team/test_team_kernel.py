@@ -69,6 +69,19 @@ class Leg(MujocoEnv):
         return jnp.sin(data.sensordata[0]), False, {}
 
 
+class StillLeg(Leg):
+    """It begins as its model does, and observes its positions."""
+
+    def initial(self, rng):
+        return self.mj_model.qpos0, jnp.zeros(self.mj_model.nv)
+
+    def observe(self, data):
+        return data.qpos
+
+    def outcome(self, before, data, action):
+        return data.qpos[0], False, {}
+
+
 class RandomLeg(Leg):
     """Its episodes have models of their own, which sensors show, too."""
 
@@ -199,15 +212,7 @@ def test_teams_show_sensors(teams):
 
 
 @pytest.mark.slow
-def test_teams_play_models_that_differ_from_episode_to_episode(teams, monkeypatch):
-    sources = []
-    write = team_kernel.player_text
-
-    def player_text(*arguments, num_actor):
-        sources.append(write(*arguments, num_actor=num_actor))
-        return sources[-1]
-
-    monkeypatch.setattr(team_kernel, "player_text", player_text)
+def test_teams_play_models_that_differ_from_episode_to_episode(teams):
     env = leg(RandomLeg, 40)
     actor, act, distribution = actor_and_act(env, (5,))
     want = played(native.native_rollout, env, (actor, act, distribution), num_seeds=2)
@@ -216,10 +221,6 @@ def test_teams_play_models_that_differ_from_episode_to_episode(teams, monkeypatc
     assert (engine.name, engine.why.partition(", ")[2]) == ("native", "16 lanes an episode")
     got = played(engine.rollout, env, (actor, act, distribution), num_seeds=2)
     assert {kernel.launch.lanes for kernel in made} == {16}
-    # What an episode draws of its model is drawn where it begins, and no step copies it.
-    begin, step = sources[-1].text.split("t.meet(running)")
-    assert begin.count("\ndraw(M, s, ") == 1
-    assert "draw(M, s, " not in step
     masses = want.observation[:, 0, :, -1].ravel()
     assert len(np.unique(masses)) == masses.size == 10  # the episodes of a kernel
     for name in ("observation", "reward"):
@@ -261,6 +262,48 @@ def test_teams_play_a_task_of_all_parts(teams):
     want = as_without_teams(teams, Robot(steps=20))
     commands = want.observation[:, 0, :, -1]
     assert len(np.unique(commands[commands != 0])) > 3
+
+
+def kernels(monkeypatch, env):
+    """Returns the texts of the kernels that play an environment, which are not compiled."""
+    texts = []
+
+    def load(key, write, capability, folder):
+        source = write()
+        texts.append(source.text)
+        return cubin.Kernel(key, source.text, source.launch, compiled=True)
+
+    gpu_on_cpu.emulate(monkeypatch)
+    monkeypatch.setattr(team, "_LEAST_DOFS", 1)
+    monkeypatch.setattr(team, "_shared_memory", lambda: 232_448)
+    monkeypatch.setattr(cubin, "load_kernel", load)
+    actor, act, distribution = actor_and_act(env, (5,))
+
+    def play(actor, key):
+        player = env, act, actor, distribution
+        return native.native_rollout(*player, key, num_episodes=5, horizon=20)
+
+    jax.eval_shape(play, actor, jax.random.key(0))
+    return texts
+
+
+def test_what_an_episode_draws_of_its_model_is_drawn_where_it_begins(monkeypatch):
+    text = kernels(monkeypatch, leg(RandomLeg, 40))[0]
+    begin, step = text.split("t.meet(running)")
+    assert begin.count("\ndraw(M, s, ") == 1
+    assert "draw(M, s, " not in step
+
+
+def test_starts_that_show_positions_alone_are_those_of_teams(monkeypatch):
+    """MJX finds no contacts of these geoms, and C MuJoCo would be the fastest but for teams."""
+    cylinders = LEG.replace('type="capsule"', 'type="cylinder"').replace(
+        "</worldbody>",
+        '<body pos=".3 0 .2"><freejoint/><geom type="cylinder" size=".1 .1"/></body></worldbody>',
+    )
+    spec = mujoco.MjSpec.from_string(cylinders)
+    env = StillLeg(xml_file=spec, frame_skip=2, max_episode_steps=30, reward_threshold=None)
+    assert env.best_in_c_mujoco
+    assert ["t.meet(" in text for text in kernels(monkeypatch, env)] == [True, True]
 
 
 def test_lanes_share_what_few_numbers_cost():
