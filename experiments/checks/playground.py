@@ -76,7 +76,7 @@ class Side:
         """
         words = jax.random.key_data(jax.random.split(jax.random.key(0), settings.episodes))
         # A start is made once: XLA need not make it fast, which takes it a minute.
-        start = jax.jit(reset).lower(words).compile({"xla_backend_optimization_level": 0})(words)
+        start = jax.jit(reset, compiler_options={"xla_backend_optimization_level": 0})(words)
 
         def play(start: Any, actions: jax.Array) -> jax.Array:
             """Returns what is compared after each env step."""
