@@ -128,9 +128,12 @@ def test_speeds_of_a_gpu_are_beside_what_teams_cover(tmp_path, monkeypatch):
         in table
     )
     assert "| refused/scene.xml | 1 | a plugin |  |  |  |  |  |  |  |" in table
-    assert "| Menagerie's robots | 3 | 2 | 2 | 6.0 |" in gpu.summary(
-        rows.read(tmp_path / "page.csv")
-    )
+    summary = gpu.summary(rows.read(tmp_path / "page.csv"))
+    assert "| Menagerie's robots | 3 | 2 | 6.0 |" in summary
+    gpu.write(tmp_path / "page.csv", tmp_path / "teams.csv", tmp_path / "nothing.csv", tmp_path)
+    untimed = rows.read(tmp_path / "page.csv")
+    assert "| slow/scene.xml | 1 | 1e-12 |  |" in gpu.robots(untimed).splitlines()
+    assert "| Menagerie's robots | 3 | 2 | not timed |" in gpu.summary(untimed)
 
 
 def test_a_robot_of_the_gpus_rows_plays(tmp_path):

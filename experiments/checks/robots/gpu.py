@@ -159,16 +159,21 @@ def robots(raw_rows: Sequence[Mapping[str, str]]) -> str:
         ours, warp = row[f"native_{number}"], row[f"warp_{number}"]
         return f"{float(ours) / float(warp):.1f}" if ours and warp else ""
 
+    kept_rows = teams.SETS["Menagerie's robots"](raw_rows)
+    # There are no columns of what no GPU has timed yet.
+    are_timed = any(row[name] for row in kept_rows for name in SPEEDS)
     lines = []
-    for row in teams.SETS["Menagerie's robots"](raw_rows):
+    for row in kept_rows:
         reason = "" if row["covered"] == "yes" else row["covered"]
-        speeds = [f"{float(row[name]):,.0f}" if row[name] else "" for name in SPEEDS]
-        ratios = [ratio(row, number) for number in NUMBERS]
-        errors = [reason or row["error20"], row["error20_exact"]]
-        lines.append([row["model"], row["nv"], *errors, *speeds, *ratios])
+        line = [row["model"], row["nv"], reason or row["error20"], row["error20_exact"]]
+        if are_timed:
+            line += [f"{float(row[name]):,.0f}" if row[name] else "" for name in SPEEDS]
+            line += [ratio(row, number) for number in NUMBERS]
+        lines.append(line)
     header = ["model", "degrees of freedom", "from C MuJoCo, or why not", "tolerance 0"]
-    header += [f"{name}, {n:,}" for n in NUMBERS for name in ("teams", "Warp")]
-    header += [f"teams / Warp, {n:,}" for n in NUMBERS]
+    if are_timed:
+        header += [f"{name}, {n:,}" for n in NUMBERS for name in ("teams", "Warp")]
+        header += [f"teams / Warp, {n:,}" for n in NUMBERS]
     return table(header, lines)
 
 
@@ -183,11 +188,10 @@ def summary(raw_rows: Sequence[Mapping[str, str]]) -> str:
             for n in NUMBERS[-1:]
             if row[f"native_{n}"] and row[f"warp_{n}"]
         ]
-        middle = f"{statistics.median(ratios):.1f}" if ratios else ""
+        middle = f"{statistics.median(ratios):.1f}" if ratios else "not timed"
         num_covered = sum(row["covered"] == "yes" for row in kept)
-        lines.append([name, str(len(kept)), str(num_covered), str(len(ratios)), middle])
-    header = ["set", "robots", "covered by teams", "timed beside Warp", "median ratio to Warp"]
-    return table(header, lines)
+        lines.append([name, str(len(kept)), str(num_covered), middle])
+    return table(["set", "robots", "covered by teams", "median speed / Warp's"], lines)
 
 
 def write(path: Path, team_rows: Path, timed: Path, folder: Path) -> None:
