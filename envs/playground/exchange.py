@@ -18,6 +18,7 @@ import numpy as np
 from mujoco import mjx  # pyright: ignore[reportAttributeAccessIssue] (a C extension)
 
 from mjx_reinforce.engine.base import MjModel
+from mjx_reinforce.engine.physics import mjx_internals
 from mjx_reinforce.envs.in_batch import spec_of
 from mjx_reinforce.envs.starts import at_rest, start_shapes
 
@@ -48,14 +49,11 @@ class TaskData:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
+        if name == mjx_internals.OWN_FIELDS:  # they have no place of their own here
+            return self
         if name in self.fields:
             return self.fields[name]
         return getattr(self.source, name)
-
-    @property
-    def _impl(self) -> "TaskData":
-        """What MJX keeps apart; here it has no place of its own."""
-        return self
 
     def replace(self, **fields: Any) -> "TaskData":
         """Returns the simulation with other numbers in some fields."""

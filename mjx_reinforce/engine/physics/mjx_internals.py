@@ -55,6 +55,8 @@ tendon_dot = smooth.tendon_dot
 Collision = collision_types.Collision
 GeomInfo = collision_types.GeomInfo
 
+#: The field of an ``mjx.Data`` in which MJX keeps what is its own.
+OWN_FIELDS = "_impl"
 #: What this package was tested with; ``pyproject.toml`` bounds the versions at the same.
 TESTED_VERSIONS = {"mujoco": "4.0", "mujoco-mjx": "3.17"}
 
