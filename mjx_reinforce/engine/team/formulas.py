@@ -10,6 +10,11 @@ from typing import NamedTuple
 from mjx_reinforce.engine.scalar.nodes import Node, Scalar, is_constant
 
 
+#: Of more nodes no siblings are looked for: that takes long, and the start of an episode, which
+#: may have so many, is computed once.
+_MOST_NODES = 6_000
+
+
 class Place(NamedTuple):
     """An array of scalars in memory, and which of them is meant."""
 
@@ -61,6 +66,8 @@ class Formulas:
         """
         families: dict[int, list[Node]] = {}
         nodes = ancestors(scalars, is_apart)
+        if len(nodes) > _MOST_NODES:
+            return []
         for node in sorted(nodes, key=lambda node: node.index):
             families.setdefault(self.number(node), []).append(node)
         # What only computes as many siblings is part of their formula.
