@@ -47,6 +47,7 @@ class TaskData:
         self.source = source
 
     def __getattr__(self, name: str) -> Any:
+        """Returns a field of mjData."""
         if name.startswith("__"):
             raise AttributeError(name)
         if name == mjx_internals.OWN_FIELDS:  # they have no place of their own here

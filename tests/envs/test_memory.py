@@ -137,6 +137,7 @@ def by_vmap(env):
     return played("vmap", env)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["native", "mujoco"])
 def test_all_engines_play_the_same_episodes(env, by_vmap, engine):
     for other, expected in zip(played(engine, env), by_vmap, strict=True):
@@ -178,6 +179,7 @@ def test_an_action_comes_late_and_the_last_one_is_observed(env):
         np.testing.assert_allclose(first.pipeline_state.qpos, second.pipeline_state.qpos, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_noise_differs_from_step_to_step_and_has_its_deviation(env):
     step = jax.jit(jax.vmap(env.step))
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 500))

@@ -141,6 +141,7 @@ IDLE = """<mujoco><option><flag {}="disable"/></option><worldbody>
   <actuator><motor joint="a"/></actuator></mujoco>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flag", ["constraint", "contact"])
 def test_pairs_that_a_flag_disables_need_no_contact_of_mjx(flag):
     """dm_control's fish: MJX has no ellipsoid on a box, and looks for one all the same."""

@@ -284,6 +284,7 @@ class Mistaken(Servo):
         return action
 
 
+@pytest.mark.slow
 def test_another_number_of_controls_is_named():
     message = r"Mistaken.control must return \[2\], .* got the shape \[1\]; an action is \[1\]"
     env = Mistaken()

@@ -222,6 +222,7 @@ def learned(factor, floor=0.0):
     return jax.tree.map(jnp.subtract, after.actor.params, before.actor.params), metrics
 
 
+@pytest.mark.slow
 def test_rewards_of_any_size_teach_the_same():
     expected, _ = learned(1.0)
     for factor in (1e20, 1e30):

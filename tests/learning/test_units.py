@@ -42,6 +42,7 @@ def trained(env, **settings):
     return np.array(returns)
 
 
+@pytest.mark.slow
 def test_training_is_the_same_in_every_unit():
     """But for the rounding of the logarithm of the deviation."""
     expected = trained(Geared(1.0))
@@ -183,6 +184,7 @@ def test_what_is_loaded_plays_within_the_bounds(tmp_path):
     assert np.abs(mode).max() <= np.float32(0.03)
 
 
+@pytest.mark.slow
 def test_films_are_clipped():
     """Also with noise, in our simulation as in C MuJoCo, which asks the player."""
     env = envs.make("InvertedPendulum-v5")

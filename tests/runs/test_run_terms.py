@@ -21,6 +21,7 @@ def table(path):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_an_evaluation_has_the_mean_sum_of_each_term():
     env = Unbroken()
     learner = mr.reinforce(env, num_episodes=2)

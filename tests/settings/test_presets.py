@@ -48,6 +48,7 @@ def test_a_preset_trains(name, run, tmp_path):
         assert config[setting] == getattr(PRESETS[name][1], setting)
 
 
+@pytest.mark.slow
 def test_every_preset_makes_sense():
     """Its update is traced, not compiled."""
     for name, (line, config) in PRESETS.items():

@@ -186,6 +186,7 @@ def test_a_full_disk_costs_no_training(run, trained, tmp_path, monkeypatch, caps
         assert f"warning: cannot write {what} (No space left on device)" in output
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_with_the_engine_that_it_has(run, tmp_path):
     """Also where ``auto`` would choose another one by now."""
     assert run(*COMMON, "--max-updates", 2, "--output", "run") == 0

@@ -287,6 +287,7 @@ def kernels(monkeypatch, env):
     return texts
 
 
+@pytest.mark.slow
 def test_what_an_episode_draws_of_its_model_is_drawn_where_it_begins(monkeypatch):
     text = kernels(monkeypatch, leg(RandomLeg, 40))[0]
     begin, step = text.split("t.meet(running)")
