@@ -286,7 +286,8 @@ class PlaygroundEnv(MujocoEnv):
 
     def push(self, before: Any) -> jax.Array:
         """Returns the change of the velocities [nv] that the task's ``step`` makes first."""
-        action = jnp.zeros(self.action_size)
+        # A push that depends on the action, which is not known here, breaks the episode.
+        action = jnp.full(self.action_size, jnp.nan)
         return self._applied(before.memory, action).data.qvel - before.memory[f"{_DATA}qvel"]
 
     def remember(self, rng: jax.Array, data: Any, action: jax.Array) -> dict[str, Any]:

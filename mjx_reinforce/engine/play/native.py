@@ -18,7 +18,7 @@ from mjx_reinforce.engine.contract import check_shape
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.cpu import seam as cpu
 from mjx_reinforce.engine.gpu import seam as gpu
-from mjx_reinforce.engine.play import available
+from mjx_reinforce.engine.play import available, c_mujoco
 from mjx_reinforce.engine.play.counter import key_of_words
 from mjx_reinforce.engine.play.program import (
     NativeProgram,
@@ -124,9 +124,7 @@ def _begin(env: Environment, program: NativeProgram, keys: jax.Array) -> tuple[A
 
 def _settles(env: Any) -> bool:
     """Returns whether an environment makes physics steps before an episode begins."""
-    while hasattr(env, "env"):
-        env = env.env
-    return getattr(env, "settle_steps", 0) > 0
+    return getattr(c_mujoco.innermost(env), "settle_steps", 0) > 0
 
 
 def against_key(key: jax.Array) -> str | None:

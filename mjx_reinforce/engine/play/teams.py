@@ -39,9 +39,7 @@ def played_by(env: Any) -> str:
 
 def physics_model(env: Any) -> PhysicsModel | None:
     """Returns what an environment simulates, within wrappers too; None if it does not offer it."""
-    while hasattr(env, "env"):
-        env = env.env
-    get_model = getattr(env, "physics_model", None)
+    get_model = getattr(c_mujoco.innermost(env), "physics_model", None)
     if get_model is None:
         return None
     return get_model()

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 from mjx_reinforce.engine.scalar.nodes import Node, Scalar, is_constant
 
-
 #: Of more nodes no siblings are looked for: that takes long, and the start of an episode, which
 #: may have so many, is computed once.
 _MOST_NODES = 6_000
