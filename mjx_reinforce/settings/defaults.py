@@ -85,6 +85,8 @@ for _name, (_num_entries, _seconds) in SUITE.items():
     _figures = {
         "discount": 1 - _seconds / _CREDIT_SECONDS,
         "max_kl": _ENTRY_KL * _num_entries,
+        # All entries together begin with the same noise, in units of half their range.
+        "initial_std": _num_entries**-0.5,
         "train_horizon": round(_CUT_SECONDS / _seconds),
     }
     OF_TASKS[_PLAYGROUND + _name] = _TUNED["suite"] | _figures
