@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from mujoco_playground import registry
 
 import mjx_reinforce as mr
@@ -108,7 +109,11 @@ def _environment(task: str, batch: int, implementation: str) -> tuple[Any, str]:
     # All worlds of Warp share the room; MJX has its own in each.
     room = math.ceil(room * max(1, batch / _WORLDS))
     overrides = {"impl": implementation, "naconmax": room}
-    return registry.load(name, config_overrides=overrides), f"naconmax {room}"
+    env: Any = registry.load(name, config_overrides=overrides)
+    if implementation == "warp":
+        # Its kernels would print a line wherever the few iterations of the files are used up.
+        env._mjx_model = env.mjx_model.tree_replace({"opt._impl.warn_overflow": 0})
+    return env, f"naconmax {room}"
 
 
 def _start(env: Any, batch: int, implementation: str, key: jax.Array) -> Any:
@@ -126,8 +131,23 @@ def _compiled(stepping: Stepping) -> Stepping:
     began = time.perf_counter()
     start = stepping.start.compile()
     advance = stepping.advance.compile()
+    if stepping.row["engine"] == IMPLEMENTATIONS["warp"]:
+        # Warp compiles its kernels when they first run.
+        key = jax.random.key(0)
+        jax.block_until_ready(advance(start(key), key))
     row = stepping.row | {"compile_seconds": time.perf_counter() - began}
     return Stepping(row, start, advance)
+
+
+def _lacking(states: Any) -> str:
+    """Returns what Warp had too little room for, but for iterations, of which files allow few."""
+    from mujoco.mjx.third_party.mujoco_warp import OverflowType  # pyright: ignore
+
+    flags = OverflowType(
+        int(np.bitwise_or.reduce(np.asarray(states.data._impl.overflow), axis=None))
+    )
+    names = [flag.name for flag in flags if "ITERATIONS" not in str(flag.name)]
+    return f"too little room for {', '.join(map(str, names))}" if names else "room enough"
 
 
 def candidates(steppings: list[Stepping]) -> list[Candidate]:
@@ -148,6 +168,8 @@ def _candidate(stepping: Stepping) -> Candidate:
         return time.perf_counter() - began
 
     advance()  # warms up
+    if row["engine"] == IMPLEMENTATIONS["warp"]:
+        row = row | {"settings": f"{row['settings']}; {_lacking(states[0])}"}
     num_calls = max(1, math.ceil(_RUN_SECONDS / advance()))
 
     def run() -> None:

@@ -72,6 +72,9 @@ def playground_returns(
     """Returns the returns [N] of a policy's episodes on Playground's environment for training."""
     name = run.env.partition(":")[2]
     task: Any = registry.load(name, config_overrides={"impl": implementation})
+    if implementation == "warp":
+        # Its kernels would print a line wherever the few iterations of the files are used up.
+        task._mjx_model = task.mjx_model.tree_replace({"opt._impl.warn_overflow": 0})
     env = wrapper.wrap_for_brax_training(task, episode_length=run.horizon)
     policy = player.policy
 
