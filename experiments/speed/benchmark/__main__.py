@@ -30,8 +30,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import IO, Any, Literal, NamedTuple
+from typing import IO, Literal, NamedTuple
 
 import tyro
 
@@ -300,11 +301,12 @@ def on_gpu(task: str, settings: Settings) -> Callable[[], list[Candidate]]:
         rollout(128).run()  # the machine code is the same for any number of episodes
     plain = [batch // settings.shrink for batch in sizes.mjx]
     others = rollouts(task, "plain MJX", plain, sizes.mjx_steps) if plain else []
-    steppings: list[Any] = []
+    env_steps: Callable[[], list[Candidate]] = list
     if of_playground:
         from experiments.speed.benchmark import playground
 
-        steppings = playground.compiled(task, tuple(x // settings.shrink for x in sizes.worlds))
+        numbers = tuple(max(1, number // settings.shrink) for number in sizes.worlds)
+        env_steps = partial(playground.candidates, playground.compiled(task, numbers))
     worlds = () if of_playground else settings.batches or (*sizes.few, *sizes.warp)
     if worlds:
         added(task, 128)  # compiles
@@ -313,9 +315,7 @@ def on_gpu(task: str, settings: Settings) -> Callable[[], list[Candidate]]:
 
     def candidates() -> list[Candidate]:
         batches = [max(1, batch // settings.shrink) for batch in (*sizes.few, sizes.batch)]
-        ours = [rollout(batch) for rollout in native for batch in batches]
-        if steppings:
-            ours += playground.candidates(steppings)
+        ours = [rollout(batch) for rollout in native for batch in batches] + env_steps()
         numbers = [max(1, number // settings.shrink) for number in worlds]
         return sum((added(task, number) for number in numbers), ours + others)
 

@@ -74,8 +74,9 @@ def _traced(task: str, batch: int, implementation: str | None) -> Stepping:
     """Returns the programs of ours (None), or of Playground's own."""
     if implementation is None:
         settings = "make_vec"
-        vec = mr.make_vec(task, num_envs=batch)
-        action_size = vec.action_space.low.size
+        own: Any = mr.envs.make(task)
+        action_size = own.action_size
+        vec = mr.make_vec(own, num_envs=batch)
         start = vec.reset
         step = vec.step
     else:
@@ -105,9 +106,9 @@ def _traced(task: str, batch: int, implementation: str | None) -> Stepping:
 def _environment(task: str, batch: int, implementation: str) -> tuple[Any, str]:
     """Returns Playground's environment, and its settings in words."""
     name = task.removeprefix(PREFIX)
-    room = registry.get_default_config(name).get("naconmax", 0)
+    config: Any = registry.get_default_config(name)
     # All worlds of Warp share the room; MJX has its own in each.
-    room = math.ceil(room * max(1, batch / _WORLDS))
+    room = math.ceil(config.naconmax * max(1, batch / _WORLDS))
     overrides = {"impl": implementation, "naconmax": room}
     env: Any = registry.load(name, config_overrides=overrides)
     if implementation == "warp":
@@ -177,4 +178,4 @@ def _candidate(stepping: Stepping) -> Candidate:
         for _ in range(num_calls):
             advance()
 
-    return Candidate(row, run, num_calls * _STEPS * row["batch"])
+    return Candidate(row, run, num_calls * _STEPS * int(row["batch"]))

@@ -41,20 +41,21 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.directory is None and arguments.stage != "page":
         parser.error(f"{arguments.stage} needs a directory")
+    directory = Path(arguments.directory or "")
     if arguments.stage == "page":
         write(DATA, DOCS / "playground.md")
         return 0
     if arguments.stage == "keep":
-        keep(arguments.directory, DATA)
+        keep(directory, DATA)
         return 0
     from experiments.studies.playground import runs
 
     tasks = arguments.tasks or runs.TASKS
     if arguments.stage == "train":
-        return not runs.train(tasks, arguments.directory, arguments.num_seeds, arguments.minutes)
+        return not runs.train(tasks, directory, arguments.num_seeds, arguments.minutes)
     from experiments.studies.playground import agreement
 
-    agreement.compare(tasks, arguments.directory, arguments.episodes, arguments.impl)
+    agreement.compare(tasks, directory, arguments.episodes, arguments.impl)
     return 0
 
 

@@ -86,7 +86,7 @@ def returns(data: Path) -> str:
         mine = [result for result in measured if result.minutes == minutes]
         mean = float(np.mean([result.returns.mean() for result in mine]))
         means = [
-            np.mean([column[x.task] for x in mine if x.task in column] or [np.nan])
+            float(np.mean([column[x.task] for x in mine if x.task in column] or [np.nan]))
             for column in published.values()
         ]
         label = f"mean of {len(mine)} tasks"
