@@ -33,7 +33,8 @@ def test_a_page_is_made_of_what_is_kept(tmp_path):
     data.mkdir()
     (data / "published.csv").write_bytes((study.DATA / "published.csv").read_bytes())
     page = tmp_path / "page.md"
-    marks = "<!-- returns -->\n<!-- end -->\n<!-- agreement -->\n<!-- end -->\n"
+    marks = "<!-- not run: a comment -->\n"  # that has no end
+    marks += "<!-- returns -->\n<!-- end -->\n<!-- agreement -->\n<!-- end -->\n"
     page.write_text(marks)
     write_run(tmp_path / "one", "HopperHop", 1, [10.0, 20.0, 30.0, 40.0, 50.0, 60.0])
     write_run(tmp_path / "one", "WalkerRun", 1, [700.0] * 8)
