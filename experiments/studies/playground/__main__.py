@@ -9,7 +9,8 @@
 ``--minutes`` is for all seeds of a task together, evaluations included; compiling and the test at
 the end come on top. Of several GPUs, give each a process of its own (CUDA_VISIBLE_DEVICES) and a
 share of the tasks. Tasks follow one another; what is there is kept, and what was stopped (Ctrl-C,
-or ``timeout -s INT 570 python ...``) goes on.
+or ``timeout -s INT 570 python ...``) goes on. Programs are kept on disk: a first call for each task
+at the same time, into another folder and with ``--minutes 0.005``, compiles on all cores.
 """
 
 import argparse
