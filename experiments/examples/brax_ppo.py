@@ -11,6 +11,7 @@ fewer environments and smaller batches.
 import dataclasses
 import functools
 import time
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -47,7 +48,7 @@ def main(settings: Settings) -> None:
     env = envs.make(settings.env)
     began = time.perf_counter()
 
-    def report(steps: int, metrics: dict[str, Any]) -> None:
+    def report(steps: int, metrics: Mapping[str, Any]) -> None:
         seconds = time.perf_counter() - began
         earned = float(metrics["eval/episode_reward"])
         print(f"{steps:>11,} steps  {seconds:6.1f} s  return {earned:8.1f}", flush=True)
@@ -79,7 +80,7 @@ def main(settings: Settings) -> None:
     )
 
 
-def _replicated(tree: Any, devices: list[jax.Device]) -> Any:
+def _replicated(tree: Any, devices: Sequence[Any]) -> Any:
     """Returns a tree with an axis of devices before all others, of one device."""
     return jax.tree.map(lambda x: jnp.stack([x] * len(devices)), tree)
 

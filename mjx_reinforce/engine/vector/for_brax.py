@@ -114,5 +114,6 @@ def _as_brax(state: VectorState, sums: dict[str, jax.Array], info: dict[str, Any
         "episode_done": done,
         "episode_metrics": sums | totals,
     }
+    simulation: Any = state
     # brax's wrappers write into both dicts.
-    return State(state, state.obs, state.reward, done, dict(state.metrics), info | entries)
+    return State(simulation, state.obs, state.reward, done, dict(state.metrics), info | entries)

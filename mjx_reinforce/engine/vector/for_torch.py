@@ -95,13 +95,16 @@ class TorchVectorEnv:
         """
         self._check(actions)
         action = jnp.from_dlpack(actions.detach().contiguous())
-        self.state, outcome = self._step(self.state, action)
-        reward, done, extras = jax.tree.map(torch.from_dlpack, outcome)
+        self.state, flags = self._step(self.state, action)
+        log = self.state.metrics | {"nonfinite": flags["nonfinite"]}
+        outcome = self.state.reward, flags["done"], flags["time_outs"], log
+        reward, done, time_outs, log = jax.tree.map(torch.from_dlpack, outcome)
+        extras = {"time_outs": time_outs, "log": {f"/{name}": x for name, x in log.items()}}
         return self.get_observations(), reward, done, extras
 
     @property
     def episode_length_buf(self) -> Tensor:
-        """The steps of the running episodes [N]; RSL-RL sets it, so that they do not end at once."""
+        """The steps of the running episodes [N]; RSL-RL sets them, so that ends spread out."""
         return torch.from_dlpack(jnp.where(self.state.done, 0, self.state.episode_length))
 
     @episode_length_buf.setter
@@ -131,15 +134,16 @@ class TorchVectorEnv:
             raise ValueError(f"actions must be finite numbers, got {actions[index]} at {index}")
 
 
-def _advance(vec: VectorEnv, state: VectorState, action: jax.Array) -> tuple[VectorState, Any]:
-    """Returns the environments one step later, and what RSL-RL asks beside the observations."""
+def _advance(
+    vec: VectorEnv, state: VectorState, action: jax.Array
+) -> tuple[VectorState, dict[str, jax.Array]]:
+    """Returns the environments one step later, and flags [N] that their state does not have."""
     state = vec.step(state, action)
-    metrics = state.metrics | {"nonfinite": state.nonfinite.astype(state.reward.dtype)}
-    extras = {
+    return state, {
+        "done": state.done,
         "time_outs": state.truncated & ~state.terminated,
-        "log": {f"/{name}": x for name, x in metrics.items()},
+        "nonfinite": state.nonfinite.astype(state.reward.dtype),  # the share of them is logged
     }
-    return state, (state.reward, state.done, extras)
 
 
 def _in_words(tensor: Tensor) -> str:
