@@ -147,28 +147,14 @@ def make_set(id: str, words: Sequence[str] = ()) -> Any:
 
 @overload
 def make_vec(
-    env: "str | Environment",
-    num_envs: int,
-    *,
-    framework: Literal["jax"] = "jax",
-    autoreset: "str | enum.Enum | None" = None,
-    max_episode_steps: int | None = None,
-    engine: str = "auto",
-    **settings: object,
-) -> "VectorEnv": ...
+    env: "str | Environment", num_envs: int, *, framework: Literal["torch"], **options: Any
+) -> "TorchVectorEnv": ...
 
 
 @overload
 def make_vec(
-    env: "str | Environment",
-    num_envs: int,
-    *,
-    framework: Literal["torch"],
-    autoreset: "str | enum.Enum | None" = None,
-    max_episode_steps: int | None = None,
-    engine: str = "auto",
-    **settings: object,
-) -> "TorchVectorEnv": ...
+    env: "str | Environment", num_envs: int, *, framework: Literal["jax"] = "jax", **options: Any
+) -> "VectorEnv": ...
 
 
 def make_vec(
@@ -212,8 +198,8 @@ def make_vec(
     if framework == "torch":
         from mjx_reinforce.engine.vector.for_torch import TorchVectorEnv  # loads JAX and torch
 
-        options["autoreset"] = autoreset or "same_step"
-        return TorchVectorEnv(make_vec(env, num_envs, **options, **settings))
+        options |= settings | {"autoreset": autoreset or "same_step"}
+        return TorchVectorEnv(make_vec(env, num_envs, **options))
     from mjx_reinforce.engine.vector import environment  # loads JAX
 
     if isinstance(env, str):
@@ -235,7 +221,7 @@ def for_brax(
 ) -> "BraxEnv":
     """Makes an environment for brax's trainers, in place of the wrappers that these have.
 
-    It is the ``wrap_env_fn`` of brax's PPO: ``ppo.train(env, wrap_env_fn=envs.for_brax, ...)``. One
+    It is the ``wrap_env_fn`` of brax's PPO: ``ppo.train(env, wrap_env_fn=for_brax, ...)``. One
     call steps all environments, and each episode has a start of its own. Actions are from -1 to 1,
     which are the bounds of the environment's.
 

@@ -18,7 +18,7 @@ except ImportError as error:
         "pip install 'mjx-reinforce[rsl-rl]'"
     ) from error
 
-#: A ``torch.Tensor``, which type checkers do not see here.
+#: A tensor of torch, which type checkers do not see here.
 Tensor: TypeAlias = Any
 
 
@@ -109,6 +109,7 @@ class TorchVectorEnv:
 
     @episode_length_buf.setter
     def episode_length_buf(self, lengths: Tensor) -> None:
+        """Sets the steps of the running episodes, integers [N]."""
         if tuple(lengths.shape) != (self.num_envs,) or lengths.is_floating_point():
             raise ValueError(
                 f"episode_length_buf must be integers [{self.num_envs}], got {_in_words(lengths)}"
