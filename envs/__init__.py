@@ -18,7 +18,7 @@ from mjx_reinforce.registry import load_definition, load_own
 if TYPE_CHECKING:
     from mjx_reinforce.engine.base import Environment
     from mjx_reinforce.engine.vector.environment import VectorEnv
-    from mjx_reinforce.engine.vector.for_brax import BraxEnv
+    from mjx_reinforce.engine.vector.for_brax import BraxVectorWrapper
     from mjx_reinforce.engine.vector.for_torch import TorchVectorEnv
     from mjx_reinforce.envs.base import MujocoEnv
 
@@ -193,7 +193,7 @@ def make_vec(
       >>> state.obs.shape, state.reward.tolist()[:2]
       ((8, 4), [1.0, 1.0])
     """
-    checks.check_name("framework", framework, dict.fromkeys(("jax", "torch")))
+    checks.check_name("framework", str(framework), dict.fromkeys(("jax", "torch")))
     options: Any = {"max_episode_steps": max_episode_steps, "engine": engine}
     if framework == "torch":
         from mjx_reinforce.engine.vector.for_torch import TorchVectorEnv  # loads JAX and torch
@@ -218,7 +218,7 @@ def for_brax(
     *,
     autoreset: str = "same_step",
     engine: str = "auto",
-) -> "BraxEnv":
+) -> "BraxVectorWrapper":
     """Makes an environment for brax's trainers, in place of the wrappers that these have.
 
     It is the ``wrap_env_fn`` of brax's PPO: ``ppo.train(env, wrap_env_fn=for_brax, ...)``. One
@@ -249,11 +249,11 @@ def for_brax(
         raise ValueError(f"action_repeat must be 1, got {action_repeat!r}; set frame_skip instead")
     if randomization_fn is not None:
         raise ValueError("randomization_fn must be None: randomize of a MujocoEnv draws its model")
-    from mjx_reinforce.engine.vector.for_brax import BraxEnv  # loads JAX
+    from mjx_reinforce.engine.vector.for_brax import BraxVectorWrapper  # loads JAX
 
     if isinstance(env, str):
         env = make(env)
-    return BraxEnv(env, episode_length, autoreset, engine)
+    return BraxVectorWrapper(env, episode_length, autoreset, engine)
 
 
 def _import(id: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:

@@ -12,11 +12,11 @@ from mjx_reinforce.engine.checks import check_key, check_name
 from mjx_reinforce.engine.vector.environment import VectorState, make_vec
 
 
-class BraxEnv(Wrapper):
+class BraxVectorWrapper(Wrapper):
     """An environment whose batches step in one call; what ``envs.for_brax`` returns.
 
-    ``reset`` and ``step`` play one environment, or as many as there are keys. ``pipeline_state`` is
-    a ``VectorState``. Other attributes are those of the environment.
+    ``reset`` and ``step`` play as many as there are keys; without resets of its own, also one.
+    ``pipeline_state`` is a ``VectorState``. Other attributes are those of the environment.
 
     vec: the engine, for one environment
     episode_length: the time limit in steps, None for none
@@ -26,7 +26,7 @@ class BraxEnv(Wrapper):
         self, env: Environment, episode_length: int | None, autoreset: str, engine: str
     ) -> None:
         """Compiles the step; the arguments are those of ``envs.for_brax``."""
-        check_name("autoreset", autoreset, dict.fromkeys(("same_step", "disabled")))
+        check_name("autoreset", str(autoreset), dict.fromkeys(("same_step", "disabled")))
         super().__init__(cast(Env, env))
         options: Any = {"autoreset": autoreset, "max_episode_steps": episode_length}
         # Under ``jax.vmap``, a step is one call for all environments.
@@ -47,11 +47,20 @@ class BraxEnv(Wrapper):
         """Returns environments at the start of an episode.
 
         Args:
-          rng: a key, or [N] keys, also as words [N, 2]; consumed.
+          rng: [N] keys, also as words [N, 2], or a key; consumed.
+
+        Raises:
+          ValueError: it is no key, or one alone with autoreset "same_step".
         """
         check_key(rng)
         if not jnp.issubdtype(rng.dtype, jax.dtypes.prng_key):
             rng = jax.random.wrap_key_data(rng)
+        # Wrappers of brax, which map one, would take our time limit for an end by the task.
+        if rng.ndim == 0 and self.vec.autoreset == "same_step":
+            raise ValueError(
+                "reset takes a key for each environment, got one: brax's wrappers have no place "
+                "here; write ppo.train(env, wrap_env_fn=envs.for_brax, ...) with the task as env"
+            )
 
         def begin(key: jax.Array) -> VectorState:
             return _single(self.vec.reset(key[None]))

@@ -62,11 +62,30 @@ def test_it_plays_what_the_engine_plays(played):
 
 
 def test_one_environment_plays_as_in_a_batch(played):
-    env, brax, _ = played
-    for i in (0, 4):
+    """Without resets, to the end of the first episode, as rejax takes them."""
+    _, brax, _ = played
+    env = envs.for_brax(Drifting(SPACE, length=5.0), episode_length=7, autoreset="disabled")
+    for i in range(NUM_ENVS):
         one = play(env, env.reset(KEYS[i]), ACTIONS[:, i])
-        for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(brax), strict=True):
-            np.testing.assert_array_equal(x, y[:, i])
+        length = int(np.argmax(brax.done[:, i])) + 1
+        for field in ("done", "reward"):
+            np.testing.assert_array_equal(
+                getattr(one, field)[:length], getattr(brax, field)[:length, i]
+            )
+        last = brax.pipeline_state.final_obs[:length, i]
+        np.testing.assert_array_equal(one.obs[:length], last)
+        np.testing.assert_array_equal(
+            one.info["truncation"][:length], brax.info["truncation"][:length, i]
+        )
+
+
+def test_wrappers_around_wrappers_are_refused(played):
+    """Those of brax would take our time limit for an end by the task; ours would reset twice."""
+    env, *_ = played
+    with pytest.raises(ValueError, match=r"wrap_env_fn=envs\.for_brax"):
+        wrap(env, episode_length=7).reset(KEYS)
+    with pytest.raises(ValueError, match="BraxVectorWrapper does what is done here"):
+        envs.for_brax(env)
 
 
 def test_entries_of_wrappers_stay(played):
@@ -110,6 +129,7 @@ def test_a_task_of_ours():
         ({"action_repeat": 4}, "must be 1, got 4; set frame_skip"),
         ({"randomization_fn": print}, "randomize of a MujocoEnv"),
         ({"autoreset": "next_step"}, "Known: disabled, same_step"),
+        ({"autoreset": None}, "unknown autoreset 'None'"),
         ({"episode_length": 0}, "must be at least 1"),
     ],
 )

@@ -22,9 +22,10 @@ def test_without_torch_it_says_what_to_install(monkeypatch):
         make_vec("CartPole-v1", 2, framework="torch")
 
 
-def test_another_framework_is_refused():
-    with pytest.raises(ValueError, match=r"unknown framework 'tensorflow'\. Known: jax, torch"):
-        make_vec("CartPole-v1", 2, framework="tensorflow")
+@pytest.mark.parametrize("framework", ["tensorflow", None])
+def test_another_framework_is_refused(framework):
+    with pytest.raises(ValueError, match=rf"unknown framework '{framework}'\. Known: jax, torch"):
+        make_vec("CartPole-v1", 2, framework=framework)
 
 
 @pytest.fixture(scope="module")
