@@ -8,7 +8,7 @@ directly. Nothing heavy is imported before ``make``.
 import enum
 import re
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 from mjx_reinforce.engine import checks
 from mjx_reinforce.engine.checks import BadEnvironmentError
@@ -18,6 +18,8 @@ from mjx_reinforce.registry import load_definition, load_own
 if TYPE_CHECKING:
     from mjx_reinforce.engine.base import Environment
     from mjx_reinforce.engine.vector.environment import VectorEnv
+    from mjx_reinforce.engine.vector.for_brax import BraxVectorWrapper
+    from mjx_reinforce.engine.vector.for_torch import TorchVectorEnv
     from mjx_reinforce.envs.base import MujocoEnv
 
 silence_mjx()  # before any environment imports it
@@ -143,29 +145,44 @@ def make_set(id: str, words: Sequence[str] = ()) -> Any:
     return make(id, **read_settings(task, words))
 
 
+@overload
+def make_vec(
+    env: "str | Environment", num_envs: int, *, framework: Literal["torch"], **options: Any
+) -> "TorchVectorEnv": ...
+
+
+@overload
+def make_vec(
+    env: "str | Environment", num_envs: int, *, framework: Literal["jax"] = "jax", **options: Any
+) -> "VectorEnv": ...
+
+
 def make_vec(
     env: "str | Environment",
     num_envs: int,
     *,
-    autoreset: "str | enum.Enum" = "next_step",
+    framework: str = "jax",
+    autoreset: "str | enum.Enum | None" = None,
     max_episode_steps: int | None = None,
     engine: str = "auto",
     **settings: object,
-) -> "VectorEnv":
+) -> "VectorEnv | TorchVectorEnv":
     """Makes N environments that play at once, for any algorithm: ``mjx_reinforce.make_vec``.
 
     Args:
       env: an id of ``names()``, "module:Class" of your own, or an environment.
       num_envs: N.
+      framework: "jax"; or "torch", which gives the ``VecEnv`` of RSL-RL.
       autoreset: when an environment whose episode has ended begins the next: "next_step" and
         "same_step" are Gymnasium's, whose ``AutoresetMode`` may be given; with "disabled" only
-        ``restart`` does.
+        ``restart`` does. By default "next_step"; for torch "same_step", the only one there.
       max_episode_steps: the time limit in steps; by default the task's.
       engine: "auto", "native" (machine code), "vmap", or "mujoco" (C MuJoCo).
       **settings: of the task, where ``env`` is an id.
 
     Raises:
-      ValueError: an argument makes no sense, the environment is none, or it does not fit in memory.
+      ValueError: an argument makes no sense, the environment is none, or it does not fit in memory;
+        or torch is not installed.
 
     Examples:
       >>> import jax
@@ -176,14 +193,67 @@ def make_vec(
       >>> state.obs.shape, state.reward.tolist()[:2]
       ((8, 4), [1.0, 1.0])
     """
+    checks.check_name("framework", str(framework), dict.fromkeys(("jax", "torch")))
+    options: Any = {"max_episode_steps": max_episode_steps, "engine": engine}
+    if framework == "torch":
+        from mjx_reinforce.engine.vector.for_torch import TorchVectorEnv  # loads JAX and torch
+
+        options |= settings | {"autoreset": autoreset or "same_step"}
+        return TorchVectorEnv(make_vec(env, num_envs, **options))
     from mjx_reinforce.engine.vector import environment  # loads JAX
 
     if isinstance(env, str):
         env = make(env, **settings)
     elif settings:
         raise ValueError(f"{sorted(settings)} are for an id; this environment is made already")
-    options: Any = {"autoreset": autoreset, "max_episode_steps": max_episode_steps}
-    return environment.make_vec(env, num_envs, engine=engine, **options)
+    options["autoreset"] = "next_step" if autoreset is None else autoreset
+    return environment.make_vec(env, num_envs, **options)
+
+
+def for_brax(
+    env: "str | Environment",
+    episode_length: int | None = None,
+    action_repeat: int = 1,
+    randomization_fn: Callable[..., Any] | None = None,
+    *,
+    autoreset: str = "same_step",
+    engine: str = "auto",
+) -> "BraxVectorWrapper":
+    """Makes an environment for brax's trainers, in place of the wrappers that these have.
+
+    It is the ``wrap_env_fn`` of brax's PPO: ``ppo.train(env, wrap_env_fn=for_brax, ...)``. One
+    call steps all environments, and each episode has a start of its own. Actions are from -1 to 1,
+    which are the bounds of the environment's.
+
+    Args:
+      env: an id of ``names()``, "module:Class" of your own, or an environment.
+      episode_length: the time limit in steps; by default the task's.
+      action_repeat: 1.
+      randomization_fn: None; ``randomize`` of a ``MujocoEnv`` draws its model.
+      autoreset: "same_step", as brax's wrappers; or "disabled" for trainers with resets of their
+        own, such as rejax.
+      engine: as of ``make_vec``.
+
+    Raises:
+      ValueError: an argument makes no sense, the environment is none, or its actions are discrete.
+
+    Examples:
+      >>> import jax
+      >>> from mjx_reinforce import envs
+      >>> env = envs.for_brax("InvertedPendulum-v5")
+      >>> state = env.reset(jax.random.split(jax.random.key(0), 8))
+      >>> env.step(state, jax.numpy.zeros((8, 1))).reward.shape
+      (8,)
+    """
+    if action_repeat != 1:
+        raise ValueError(f"action_repeat must be 1, got {action_repeat!r}; set frame_skip instead")
+    if randomization_fn is not None:
+        raise ValueError("randomization_fn must be None: randomize of a MujocoEnv draws its model")
+    from mjx_reinforce.engine.vector.for_brax import BraxVectorWrapper  # loads JAX
+
+    if isinstance(env, str):
+        env = make(env)
+    return BraxVectorWrapper(env, episode_length, autoreset, engine)
 
 
 def _import(id: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:

@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PUBLIC = {name: getattr(mjx_reinforce, name) for name in mjx_reinforce.__all__}
 del PUBLIC["__version__"]
-TASK_NAMES = ("names", "make", "register", "from_playground")
+TASK_NAMES = ("names", "make", "register", "from_playground", "for_brax")
 TASKS = {f"envs.{name}": getattr(envs, name) for name in TASK_NAMES}
 PARTS = {f"envs.parts.{name}": getattr(parts, name) for name in parts.__all__}
 #: Comment before a block that no test runs, with the reason.

@@ -16,7 +16,9 @@ from sizes import package_files
 OUTSIDE = """
     DIR ID NAME RUN RUN_OR_SWEEP VALUE sum_n sum_t seed_0
     Acc EpisodeWrapper JaxprEqn Linear MjxEnv SummaryWriter Vel binomtest custom_vjp do_simulation
-    nohup np_random platform_dependent simple tip __future__ annotations
+    TensorDict VecEnv bootstrap_on_timeout nohup np_random platform_dependent simple tip
+    wrap_env_fn
+    __future__ annotations
     """
 #: Functions and variables in the source of C MuJoCo, to which comments on our physics point.
 C_MUJOCO = """

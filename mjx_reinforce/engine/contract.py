@@ -24,9 +24,9 @@ from mjx_reinforce.engine.checks import BadEnvironmentError, require
 #: What JAX raises where Python or NumPy asks for the value of a traced array.
 _VALUE_ERRORS = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
 _ADVICE = "; it is compiled by JAX: write jnp.where for `if`, and jnp for numpy, math and float()"
-#: Ends of names of brax's and Playground's wrappers that map an environment, or reset it where an
-#: episode ends: what the last action led to is lost there.
-_FOREIGN_WRAPPERS = ("AutoResetWrapper", "VmapWrapper")
+#: Ends of names of wrappers of brax and Playground, and of ours for brax, that map an environment,
+#: or reset it where an episode ends: what the last action led to is lost there.
+_FOREIGN_WRAPPERS = ("AutoResetWrapper", "BraxVectorWrapper", "VmapWrapper")
 
 
 def check_environment(env: Environment) -> None:

@@ -1,15 +1,12 @@
 """Many environments at once: episodes follow each other as Gymnasium says, on every engine."""
 
 import functools
-import re
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.envs.wrappers.training import AutoResetWrapper, EpisodeWrapper, VmapWrapper, wrap
-from brax.training.agents.ppo import train as ppo
+from brax.envs.wrappers.training import AutoResetWrapper, EpisodeWrapper, VmapWrapper
 from toys import Drifting
 
 from experiments.checks.vector_parity import GymnasiumSide, compare
@@ -230,76 +227,3 @@ def test_parity_with_gymnasium(autoreset):
     assert (apart.final > 0) == (autoreset == "same_step")
     assert apart.flags == 0
     assert apart.ends > 6
-
-
-# -------------------------------------------------------------------------------------------------
-# The environments as brax's trainers take them, by the class of docs/vector.md: what brax's own
-# wrappers show, and a training.
-
-PAGE = (Path(__file__).parents[3] / "docs" / "vector.md").read_text("utf-8")
-CART = "ContinuousCartPole-v0"
-
-
-def made(env, num_envs, **options):
-    (code,) = re.findall(r"^from brax.envs.base import .*?(?=^```)", PAGE, re.S | re.M)
-    known = {}
-    exec(code, known)
-    vec = make_vec(env, num_envs, autoreset="same_step", **options)
-    return known["BraxVectorEnv"](vec)
-
-
-@pytest.mark.slow
-def test_brax_sees_the_environments_as_its_wrappers_show_them():
-    """The same starts and actions: its rewards, ends and observations, until an episode ends."""
-    ours = made(CART, 4, max_episode_steps=15)
-    theirs = wrap(envs.make(CART), episode_length=15)
-    keys = jax.random.split(jax.random.PRNGKey(0), 4)  # brax knows no others
-    mine = ours.reset(keys)
-    other = theirs.reset(jax.vmap(lambda key: jax.random.split(key)[1])(keys))
-    assert (ours.observation_size, ours.action_size) == (4, 1)
-    np.testing.assert_allclose(mine.obs, other.obs, atol=1e-6)
-    action = jnp.array([[0.0], [0.01], [-0.01], [1.0]])
-    step, their_step = jax.jit(ours.step), jax.jit(theirs.step)
-    running = np.ones(4, bool)
-    cut = 0
-    for _ in range(15):
-        mine, other = step(mine, action), their_step(other, action * ours.vec.action_space.high)
-        for name in ("reward", "done"):
-            found, expected = getattr(mine, name), getattr(other, name)
-            np.testing.assert_allclose(found[running], expected[running], atol=1e-5)
-        for name in ("truncation", "episode_done"):
-            np.testing.assert_array_equal(mine.info[name][running], other.info[name][running])
-        found, expected = (x.info["episode_metrics"] for x in (mine, other))
-        for name in ("sum_reward", "length"):
-            np.testing.assert_allclose(found[name][running], expected[name][running], atol=1e-4)
-        cut += int(mine.info["truncation"][running].sum())
-        running &= np.asarray(mine.done) == 0
-        np.testing.assert_allclose(mine.obs[running], other.obs[running], atol=1e-4)
-    assert 0 < cut < 4
-
-
-@pytest.mark.slow
-def test_its_ppo_trains(monkeypatch):
-    """With the function that brax 0.14.2 calls and JAX 0.10 has no more (docs/vector.md)."""
-    monkeypatch.setattr(
-        jax,
-        "device_put_replicated",
-        lambda tree, devices: jax.tree.map(lambda x: jnp.stack([x] * len(devices)), tree),
-        raising=False,
-    )
-    told = []
-    ppo.train(
-        made(CART, 16),
-        num_timesteps=4_000,
-        num_evals=2,
-        num_envs=16,
-        num_eval_envs=16,
-        wrap_env=False,
-        episode_length=500,
-        unroll_length=5,
-        batch_size=16,
-        num_minibatches=2,
-        progress_fn=lambda steps, metrics: told.append((steps, metrics["eval/episode_reward"])),
-    )
-    assert [steps >= 4_000 for steps, _ in told] == [False, True]
-    assert all(8 < reward < 500 for _, reward in told)
