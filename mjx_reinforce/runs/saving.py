@@ -239,7 +239,7 @@ class RunFiles(Files[RunDriver]):
         run_progress = {
             "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "updates": driver.updates(),
-            "env_steps": int(driver.record.env_steps.sum()),
+            "env_steps": int(driver.record.played_steps().sum()),
         }
         budgets = {name: getattr(driver.config, name) for name in resume.BUDGETS}
         resumed = [*self.contents.get("resumed", []), run_progress]
@@ -282,7 +282,7 @@ class RunFiles(Files[RunDriver]):
             "env": driver.config.env,
             "num_seeds": driver.config.num_seeds,
             "updates": driver.updates(),
-            "env_steps": int(driver.record.env_steps.sum()),
+            "env_steps": int(driver.record.played_steps().sum()),
         }
         self._attempt("summary.json", lambda: self._write_json("summary.json", run_progress))
 
@@ -297,8 +297,8 @@ class RunFiles(Files[RunDriver]):
     def _save_policies(self, driver: RunDriver) -> None:
         """Writes the last and the best policies."""
         settings = self._plan.group_plans[0].ready.policy
-        save_policy(self._folder("policy"), driver.states.train_states.actor, settings)
-        save_policy(self._folder("policy", "best"), driver.best.actor, settings)
+        save_policy(self._folder("policy"), driver.last_actors(), settings)
+        save_policy(self._folder("policy", "best"), driver.best_actors(), settings)
 
     def _write_rows(self) -> None:
         """Appends to metrics.csv the rows that it lacks."""

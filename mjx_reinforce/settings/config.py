@@ -69,6 +69,11 @@ class Config(
         return read_seeds(self.seeds).start
 
     @property
+    def num_policies(self) -> int:
+        """How many policies are trained side by side: those that race, of all seeds."""
+        return self.num_seeds * self.race
+
+    @property
     def episodes_per_update(self) -> int:
         """Episodes that a seed plays for an update."""
         return find_algorithm(self.algorithm).search_episodes or self.num_episodes
@@ -165,6 +170,12 @@ def check_each(config: Config) -> None:
             # None and words, such as "budget", are no numbers, and ``check_type`` let them pass.
             if not (value is None or isinstance(value, str) or rule.holds(value)):
                 raise ValueError(f"{flag(name)} must be {rule.words}, got {reprlib.repr(value)}")
+    last_seed = config.first_seed + config.num_seeds - 1
+    if (last_seed + 1) * config.race > MAX_OF_UPDATE:
+        raise ValueError(
+            f"--race {config.race} has no random numbers for seed {last_seed:,}: a race of seed n "
+            f"takes those of the seeds from {config.race} n on; lower one of them"
+        )
 
 
 #: The package that each log needs.

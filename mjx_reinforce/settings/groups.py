@@ -91,6 +91,11 @@ class RunSettings:
     )
     """FIRST:END, in place of --num-seeds: seeds FIRST to END - 1, a share of a larger run, for one
     of several machines. `python -m mjx_reinforce.report A B` joins shares."""
+    race: int = setting(1, *COUNT, once="it is for one run")
+    """Policies that train for each seed and race: at a quarter, a half and three quarters of the
+    budget, the half with the better training returns replaces the other half, and goes on with
+    random numbers of its own; the best one at the end is the seed's. Each has --env-steps, so that
+    a seed costs as many times as much. A mean over such seeds is one of races: say so beside it."""
     seed: int = setting(
         0,
         Range.SEED,

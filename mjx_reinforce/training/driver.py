@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
 
+import jax
 import numpy as np
 
 from mjx_reinforce.files import Arrays
@@ -12,10 +13,19 @@ from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import MAX_COUNT, Config
+from mjx_reinforce.training import race
 from mjx_reinforce.training.record import HOPELESS, Measured, Record, RunRecord
 from mjx_reinforce.training.resume import Checkpoint, check_arrays, decisive
 from mjx_reinforce.training.slots import Slots, Stopwatch
-from mjx_reinforce.training.state import Best, Budget, StateRows, begin_with, first_best, keep_best
+from mjx_reinforce.training.state import (
+    Best,
+    Budget,
+    StateRows,
+    begin_with,
+    copied,
+    first_best,
+    keep_best,
+)
 
 
 class Evaluation(NamedTuple):
@@ -191,6 +201,7 @@ class Driver:
                 if evaluate:
                     self._take([self.slots.evaluate()])
                 break
+            self._cut()
             start = time.perf_counter()
             active, lengths = self.record.moved()
             blocks = self.slots.advance(active, lengths, evaluate=evaluate, max_blocks=num_blocks)
@@ -199,6 +210,9 @@ class Driver:
             timely_blocks = len(blocks) * _CALL_SECONDS / (time.perf_counter() - start)
             num_blocks = max(1, min(int(timely_blocks), 2 * len(blocks), max_blocks))
             self._take(blocks)
+
+    def _cut(self) -> None:
+        """Drops policies of races where that is due; those of a sweep do not race."""
 
     def _max_blocks(self) -> int:
         """Returns how many blocks of updates are made before the host sees any of them."""
@@ -228,8 +242,8 @@ class RunDriver(Driver):
     """Trains the seeds of a run by itself, which has evaluations to show and best policies.
 
     config: the settings of the run, its horizon among them
-    states: of training, on the host
-    best: the best policies so far
+    states: of training, on the host, of the R policies, see ``RunRecord``
+    best: the best of each of these so far
     """
 
     record: RunRecord
@@ -271,6 +285,25 @@ class RunDriver(Driver):
         if self.ended and not self.record.is_evaluated():
             self._take([self.slots.evaluate()])
 
+    def _cut(self) -> None:
+        # Before a block, and so decided by what a checkpoint holds: a run that goes on cuts too.
+        policy_sources = self.record.cut()
+        if policy_sources is not None:
+            self.slots.restore(copied(self.states, policy_sources))
+            self.states = self.slots.states()
+
+    def last_actors(self) -> Actor:
+        """Returns the newest policy of each seed [S, ...]."""
+        return _entries(self.states.train_states.actor, self.record.leaders())
+
+    def best_actors(self) -> Actor:
+        """Returns the policies of the seeds [S, ...] with the best evaluations."""
+        return _entries(self.best.actor, self._best_rows())
+
+    def _best_rows(self) -> np.ndarray:
+        """Returns the number of the policy with the best evaluation of each seed [S]."""
+        return race.leaders(self.best.eval_return, self.config.race)
+
     def _max_blocks(self) -> int:
         """Returns 1: ``_take`` has the states before one block and after it, none between."""
         return 1
@@ -291,13 +324,14 @@ class RunDriver(Driver):
         )
         self.best = keep_best(self.best, present_best)
         rows = self.record.add_evaluation(measured, self._reached)
+        leaders = self.record.leaders()
         evaluation = Evaluation(
-            updates=counts.to_int(num_updates),
-            env_steps=self.record.env_steps.copy(),
+            updates=counts.to_int(num_updates[leaders]),
+            env_steps=self.record.played_steps(),
             seconds=self._reached,
-            measured=eval_metrics,
-            actor=actor,
-            train_states=self.states.train_states,
+            measured=_entries(eval_metrics, leaders),
+            actor=_entries(actor, leaders),
+            train_states=_entries(self.states.train_states, leaders),
         )
         for observer in self.observers:
             observer.evaluated(self, evaluation, rows)
@@ -314,13 +348,17 @@ class RunDriver(Driver):
           The returns of both, or nothing if it was interrupted.
         """
         returns = {}
-        for name, actor in (("final", self.states.train_states.actor), ("best", self.best.actor)):
+        tested_policies = (
+            ("final", self.states.train_states.actor, self.record.leaders()),
+            ("best", self.best.actor, self._best_rows()),
+        )
+        for name, actor, rows in tested_policies:
             # Half a test is none: summary.json has both returns or neither.
             if interrupted():
                 return {}
             eval_metrics = self.slots.test(actor)
             self.record.count_steps(eval_metrics)
-            returns[f"{name}_test_returns"] = eval_metrics["eval_return"].tolist()
+            returns[f"{name}_test_returns"] = eval_metrics["eval_return"][rows].tolist()
         return returns
 
     def summary(self, engine: str, compile_seconds: float, test: dict[str, Any]) -> dict[str, Any]:
@@ -339,9 +377,14 @@ class RunDriver(Driver):
         return {
             **status,
             **self.record.summary(engine, compile_seconds, self.seconds()),
-            "best_updates": counts.to_int(self.best.num_updates).tolist(),
+            "best_updates": counts.to_int(self.best.num_updates[self._best_rows()]).tolist(),
             **test,
         }
+
+
+def _entries(leaves: Any, places: np.ndarray) -> Any:
+    """Returns a pytree of some entries [S, ...] of leaves [R, ...]."""
+    return jax.tree.map(lambda leaf: leaf[places], leaves)
 
 
 def sweep_summary(
