@@ -227,8 +227,14 @@ class RunFiles(Files[RunDriver]):
         settings = dataclasses.asdict(config) | {"output": str(self._directory)}
         del settings["resume"]
         played_by = {"played_by": self._plan.group_plans[0].ready.engine}
-        self._write_json("config.json", settings | played_by | provenance())
+        self.contents = settings | played_by | provenance()
+        self._write_config(config)
         write_bytes(self._metrics, header(self._plan.group_plans[0].ready.terms))
+
+    def _write_config(self, config: Config) -> None:
+        """Writes config.json with the present budgets."""
+        self.contents |= {name: getattr(config, name) for name in resume.BUDGETS}
+        self._write_json("config.json", self.contents)
 
     def _take_back(self, driver: RunDriver, checkpoint: Checkpoint | None) -> None:
         """Takes the files back to a checkpoint, and says in config.json that the run goes on.
@@ -241,9 +247,8 @@ class RunFiles(Files[RunDriver]):
             "updates": driver.updates(),
             "env_steps": int(driver.record.played_steps().sum()),
         }
-        budgets = {name: getattr(driver.config, name) for name in resume.BUDGETS}
-        resumed = [*self.contents.get("resumed", []), run_progress]
-        self._write_json("config.json", self.contents | budgets | {"resumed": resumed})
+        self.contents["resumed"] = [*self.contents.get("resumed", []), run_progress]
+        self._write_config(driver.config)
         self._write_json("summary.json", {"status": "running", **run_progress})
         if checkpoint is None:
             resume.remove_checkpoints(self._checkpoints, last_number=0)
@@ -289,6 +294,9 @@ class RunFiles(Files[RunDriver]):
     def _save_checkpoint(self, driver: RunDriver) -> None:
         """Writes a checkpoint, which says how long metrics.csv is with all rows in it."""
         self._write_rows()
+        # First, as it chooses the checkpoint.
+        if tuple(self.contents["budgets"]) != driver.config.budgets:
+            self._write_config(driver.config)
         checkpoint = driver.checkpoint()._replace(metrics_bytes=self._metrics.stat().st_size)
         resume.save(
             self._checkpoints, checkpoint, is_even=checkpoint.is_even(driver.config.eval_every)

@@ -92,6 +92,23 @@ class Config(
             return limit
         return min(limit, self.train_horizon)
 
+    def env_steps_at(self, num_updates: int) -> int | None:
+        """Returns the budget in env steps after so many updates.
+
+        That is ``env_steps``, unless ``budgets`` says how it came about.
+        """
+        if self.budgets[-1:] != (self.env_steps,):  # another budget was given since
+            return self.env_steps
+        pairs = zip(self.budgets[::2], self.budgets[1::2], strict=True)
+        past_budgets = [env_steps for update, env_steps in pairs if update <= num_updates]
+        return (past_budgets or [self.env_steps])[-1]
+
+    def with_budget(self, num_updates: int, env_steps: int) -> "Config":
+        """Returns the settings with another budget in env steps from an update on."""
+        past_budgets = self.budgets if self.budgets[-1:] == (self.env_steps,) else ()
+        budgets = (*past_budgets, num_updates, env_steps)
+        return dataclasses.replace(self, minutes=None, env_steps=env_steps, budgets=budgets)
+
     @property
     def block_length(self) -> int:
         """How many updates a block between two evaluations has room for.
