@@ -3,10 +3,12 @@
 import dataclasses
 import itertools
 import json
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from saved_runs import assert_same
 
 from experiments.kit.trainings import results
 from mjx_reinforce.learning import counts
@@ -56,6 +58,23 @@ def test_minutes_become_env_steps_that_repeat_the_run_and_go_on(run, tmp_path, c
         assert run(*arguments) == 2
         assert words in capsys.readouterr().err
     assert results(second) == before
+
+
+@pytest.mark.slow
+def test_a_run_in_time_goes_on_from_any_of_its_budgets(run, tmp_path):
+    """Its newest checkpoint may be of an earlier budget than config.json says."""
+    timed = ["--minutes", 0.05, "--checkpoint-every", 5, "--output", "whole"]
+    assert run(*SMALL, *timed) == 0
+    whole = tmp_path / "whole"
+    assert len(settings(whole)["budgets"]) > 4
+    parts = shutil.copytree(whole, tmp_path / "parts")
+    (parts / "summary.json").write_text('{"status": "running"}')
+    [_, *newer] = sorted((parts / "checkpoint").iterdir())
+    for path in newer:
+        path.unlink()
+    assert run("--resume", "parts") == 0
+    assert settings(parts)["resumed"][0]["updates"] > 0
+    assert_same(whole, parts)
 
 
 @pytest.mark.slow
