@@ -574,8 +574,11 @@ class MujocoEnv(Env):
 
     @functools.cached_property
     def _shown(self) -> Callable[..., Any]:
+        # What contacts do is in the data already; of what MJX refuses, it knows all else.
+        known = self._model or models.without_contacts(self.mj_model)
+
         def completed_data(fields: dict[str, jax.Array], data: mjx.Data, touch: jax.Array) -> Any:
-            model = self.model.replace(**fields)
+            model = known.replace(**fields)
             return last_pass.completed_data(self.mj_model, model, data, touch)
 
         return jax.jit(completed_data)

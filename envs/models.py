@@ -155,15 +155,22 @@ def make_data(model: MjModel) -> mjx.Data:
     try:
         return contacts.make_data(model, device)
     except (NotImplementedError, ValueError):  # as MJX says that it has no such function
-        idle_model: Any = copy.copy(model)
-        idle_model.opt.disableflags |= _C.mjtDisableBit.mjDSBL_CONTACT
-        return contacts.make_data(_without_idle_pairs(idle_model), device)
+        return contacts.make_data(_without_contacts(model), device)
+
+
+def without_contacts(model: MjModel) -> mjx.Model:
+    """Returns MJX's version of a model in which nothing touches: all but contacts is the same."""
+    device = jax.local_devices()[0]
+    # It may be asked for while something is traced; its arrays are constants there.
+    with jax.ensure_compile_time_eval():
+        return mjx.put_model(_without_contacts(model), impl="jax", device=device)
 
 
 def has_data(model: MjModel) -> bool:
     """Returns whether MJX has a simulation of a model, which it need not be able to step."""
     try:
         jax.eval_shape(lambda: make_data(model))
+        without_contacts(model)
     except Exception:  # whatever MJX raises of what it does not know
         return False
     return True
@@ -191,6 +198,13 @@ def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
     except Exception as error:  # of another library: no refusal
         raise BadEnvironmentError(f"converting {name} to MJX fails: {explain(error)}") from error
     return mjx_model
+
+
+def _without_contacts(model: MjModel) -> MjModel:
+    """Returns a model in which nothing touches."""
+    idle_model: Any = copy.copy(model)
+    idle_model.opt.disableflags |= _C.mjtDisableBit.mjDSBL_CONTACT
+    return _without_idle_pairs(idle_model)
 
 
 def _without_idle_pairs(model: MjModel) -> MjModel:

@@ -41,7 +41,8 @@ def filled(text: str, tables: Mapping[str, Callable[[], str]]) -> str:
     """
 
     def made(found: re.Match[str]) -> str:
-        name = found[2]
-        return f"{found[1]}{tables[name]()}\n<!-- end -->" if name in tables else found[0]
+        return f"{found[1]}{tables[found[2]]()}\n<!-- end -->"
 
-    return re.sub(r"(<!-- ([^\n]+) -->\n).*?<!-- end -->", made, text, flags=re.DOTALL)
+    # Other comments, such as of what is not run, stand on the page, too.
+    names = "|".join(map(re.escape, tables))
+    return re.sub(rf"(<!-- ({names}) -->\n).*?<!-- end -->", made, text, flags=re.DOTALL)

@@ -50,6 +50,8 @@ _NO_SETTINGS = ("task", "at_least", "minute")
 _TUNED = read_tables("tuned.toml")
 #: Environment id -> its time limit (env steps).
 HORIZONS: dict[str, int] = _TUNED.pop("horizons")
+#: Name of a task of Playground's suite -> entries of an action, and the time of an env step (s).
+SUITE: dict[str, tuple[int, float]] = _TUNED.pop("playground")
 _ROWS = [table for table in _TUNED.values() if "task" in table]
 
 
@@ -69,6 +71,27 @@ for _row in _ROWS:
 MINUTES: dict[str, tuple[int, int]] = {
     task: row["minute"] for task, row in _SMALLEST.items() if "minute" in row
 }
+
+#: What stands before the names of Playground's tasks.
+_PLAYGROUND = "playground:"
+#: An action is credited with the rewards of about so long (s).
+_CREDIT_SECONDS = 2.0
+#: The limit of an update, for each entry of an action (nats). That of several entries is the sum
+#: of theirs; of Gymnasium's tasks, those found for many episodes are 0.005 to 0.019 an entry.
+_ENTRY_KL = 0.0125
+#: Training episodes are cut after so long at first (s).
+_CUT_SECONDS = 10.0
+for _name, (_num_entries, _seconds) in SUITE.items():
+    _figures = {
+        "discount": 1 - _seconds / _CREDIT_SECONDS,
+        "max_kl": _ENTRY_KL * _num_entries,
+        # All entries together begin with the same noise, in units of half their range.
+        "initial_std": _num_entries**-0.5,
+        "train_horizon": round(_CUT_SECONDS / _seconds),
+    }
+    OF_TASKS[_PLAYGROUND + _name] = _TUNED["suite"] | _figures
+    _long = _TUNED["suite-long"]
+    OF_BUDGETS[_PLAYGROUND + _name] = [(_long["at_least"], _without_facts(_long))]
 
 #: Where a budget is large, it has about so many evaluations.
 _EVALUATIONS = 50

@@ -16,6 +16,7 @@ from mjx_reinforce import envs, make_vec
 from mjx_reinforce.engine import contract
 from mjx_reinforce.envs.in_mujoco import InMujoco
 from mjx_reinforce.export.control import affine_control
+from mjx_reinforce.settings.defaults import SUITE
 
 package = pytest.importorskip("mujoco_playground")
 from ml_collections import config_dict  # noqa: E402
@@ -300,3 +301,15 @@ def test_without_playground_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco_playground", None)
     with pytest.raises(ValueError, match=r"pip install 'mjx-reinforce\[playground\]'"):
         envs.make("playground:WalkerRun")
+
+
+@pytest.mark.slow
+def test_the_suites_figures_are_those_of_its_tasks():
+    """The settings of its tasks follow from these, which are known before one is imported."""
+    from mujoco_playground import dm_control_suite
+
+    assert sorted(SUITE) == sorted(dm_control_suite.ALL_ENVS)
+    for name, (num_entries, seconds) in SUITE.items():
+        task = dm_control_suite.load(name)
+        assert (num_entries, seconds) == (task.action_size, task.dt), name
+        assert task._config.episode_length == 1000, name

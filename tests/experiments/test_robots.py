@@ -5,7 +5,7 @@ import itertools
 import pytest
 
 from experiments.checks.robots import __main__ as robots
-from experiments.checks.robots import gpu, page, playing, teams
+from experiments.checks.robots import gpu, models, page, playing, teams
 from experiments.kit import device_code, rows
 from experiments.speed.benchmark import rows as benchmark_rows
 from experiments.speed.benchmark.robots import make
@@ -85,6 +85,25 @@ def test_teams_are_compared_with_c_mujoco_and_counted(tmp_path, capsys):
     table = capsys.readouterr().out.splitlines()
     assert "| Menagerie's files for MJX | 1 | 0 | 0 | 0 | 0 | 0 |" in table
     assert table[-1] == "| all | 2 | 1 | 1 | 1 | 1 | 1 |"
+
+
+def test_only_meshes_that_are_not_there_are_tetrahedra(tmp_path):
+    corners = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+    text = "".join(f"v {x} {y} {z}\n" for x, y, z in corners) + "f 1 2 3\n"
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "cube.obj").write_text(text)
+    meshes = "".join(
+        f'<mesh file="{x}.obj" inertia="convex"/>' for x in ("cube", "parts/cube", "gone")
+    )
+    geoms = "".join(f'<geom type="mesh" mesh="{x}"/>' for x in ("near", "cube", "gone"))
+    meshes = meshes.replace('"parts/cube.obj"', '"parts/cube.obj" name="near"')
+    body = f"<body><freejoint/>{geoms}</body>"
+    (tmp_path / "robot.xml").write_text(
+        f"<mujoco><asset>{meshes}</asset><worldbody>{body}</worldbody></mujoco>"
+    )
+    model, stubs = models.load(tmp_path / "robot.xml")
+    assert stubs == "2 meshes are tetrahedra"
+    assert [model.mesh(x).vertnum[0] for x in ("near", "cube", "gone")] == [8, 4, 4]
 
 
 def test_speeds_of_a_gpu_are_beside_what_teams_cover(tmp_path, monkeypatch):

@@ -83,7 +83,7 @@ def test_no_task_of_ours_trains_otherwise():
     """Those whose half range is not 1 have a deviation in their own table."""
     tuned = {task for task, settings in OF_TASKS.items() if "initial_std" in settings}
     checked = 0
-    for task in OF_TASKS | OF_BUDGETS:
+    for task in (OF_TASKS | OF_BUDGETS).keys() & set(envs.names()):
         space = action_space(envs.make(task))
         if isinstance(space, Box) and not np.all(space.high - space.low == 2):
             assert task in tuned, task

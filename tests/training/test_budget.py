@@ -11,6 +11,7 @@ import pytest
 from saved_runs import assert_same
 
 from experiments.kit.trainings import results
+from mjx_reinforce import envs
 from mjx_reinforce.learning import counts
 from mjx_reinforce.runs.command_line import parse
 from mjx_reinforce.settings import defaults
@@ -81,7 +82,7 @@ def test_a_run_in_time_goes_on_from_any_of_its_budgets(run, tmp_path):
 @pytest.mark.parametrize("gpu", [False, True])
 def test_a_default_run_has_the_budget_of_its_machine(monkeypatch, gpu):
     monkeypatch.setattr(defaults, "has_gpu", lambda: gpu)
-    for env in defaults.OF_TASKS:
+    for env in defaults.OF_TASKS.keys() & set(envs.names()):
         config = of_task(env)
         check(config)
         assert config.env_steps == defaults.MINUTES.get(env, (Config.env_steps,) * 2)[gpu]
@@ -101,6 +102,26 @@ def test_a_default_run_has_the_budget_of_its_machine(monkeypatch, gpu):
     alone = of_task("Walker2d-v5", num_seeds=1)  # two cores play more of one seed
     assert (alone.env_steps == 4 * 3_900_000) != gpu
     assert alone.update == "natural-gradient"
+
+
+def test_the_suite_of_playground_has_one_rule():
+    """What differs between its tasks follows from the size of an action and the time of a step."""
+    walker, cheetah = (of_task(f"playground:{name}") for name in ("WalkerRun", "CheetahRun"))
+    check(walker)
+    assert parse(["--env", "playground:WalkerRun"]).base == walker
+    same = {name: getattr(walker, name) for name in ("env", "discount", "train_horizon")}
+    assert dataclasses.replace(cheetah, **same) == walker
+    # Both credit an action with the rewards of two seconds, and cut episodes after ten.
+    assert 0.025 / (1 - walker.discount) == pytest.approx(2)
+    assert 0.01 / (1 - cheetah.discount) == pytest.approx(2)
+    assert (walker.train_horizon, cheetah.train_horizon) == (400, 1000)
+    humanoid = of_task("playground:HumanoidRun", env_steps=10**9)
+    assert humanoid.max_kl == pytest.approx(21 / 6 * walker.max_kl)
+    assert humanoid.initial_std == pytest.approx(21**-0.5)
+    assert humanoid.num_episodes == 1024
+    assert of_task("playground:Go1JoystickFlatTerrain") == Config(
+        env="playground:Go1JoystickFlatTerrain"
+    )
 
 
 def test_a_budget_chooses_the_settings():

@@ -33,7 +33,7 @@ _AT_ONCE = 8
 _LEAST_SECONDS = 120.0
 _MOST_SECONDS = 300.0
 #: Env steps of an episode, and timed runs after one that warms up.
-_STEPS = 50
+_STEPS = 25
 _REPEATS = 2
 #: By how much each speed differs from rest where an episode begins (m/s, rad/s).
 _SPEED = 0.1

@@ -56,17 +56,37 @@ def load(path: Path) -> tuple[Any, str]:
     Raises:
       ValueError: C MuJoCo cannot load it.
     """
-    try:
-        return mujoco.MjModel.from_xml_path(str(path)), ""
-    except ValueError as error:
-        if not re.search(_ABSENT, str(error)):
-            raise
+    num_tetrahedra = 0
     spec = mujoco.MjSpec.from_file(str(path))
+    while True:
+        try:
+            model = spec.compile()
+        except ValueError as error:
+            absent = _absent_meshes(spec, str(error))
+            if not absent:
+                raise
+        else:
+            return model, f"{num_tetrahedra} meshes are tetrahedra" if num_tetrahedra else ""
+        num_tetrahedra += len(absent)
+        for mesh in absent:
+            mesh.file = ""
+            mesh.uservert = _TETRAHEDRON.ravel()
+            mesh.scale = [1, 1, 1]
+        _remove_looks(spec)
+
+
+def _absent_meshes(spec: Any, message: str) -> list[Any]:
+    """Returns the meshes of the file that C MuJoCo does not find, all if it names none."""
+    if not re.search(_ABSENT, message):
+        return []
     meshes = [mesh for mesh in spec.meshes if mesh.file]
-    for mesh in meshes:
-        mesh.file = ""
-        mesh.uservert = _TETRAHEDRON.ravel()
-        mesh.scale = [1, 1, 1]
+    named = [mesh for mesh in meshes if re.search(rf"[/']{re.escape(mesh.file)}'", message)]
+    longest = max((mesh.file for mesh in named), key=len, default="")
+    return [mesh for mesh in named if mesh.file == longest] or meshes
+
+
+def _remove_looks(spec: Any) -> None:
+    """Puts plain colors in the place of textures, and deletes skins."""
     for texture in spec.textures:
         texture.file = ""
         texture.cubefiles = [""] * len(texture.cubefiles)
@@ -75,7 +95,6 @@ def load(path: Path) -> tuple[Any, str]:
         texture.gridsize = [1, 1]
     for skin in [*spec.skins]:
         spec.delete(skin)
-    return spec.compile(), f"{len(meshes)} meshes are tetrahedra"
 
 
 def mechanism(model: Any) -> str:

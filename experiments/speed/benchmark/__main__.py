@@ -30,6 +30,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import IO, Literal, NamedTuple
 
@@ -47,6 +48,7 @@ class Sizes(NamedTuple):
 
     batch, steps: of native's episodes
     few: native is timed with so many episodes too, and MuJoCo Warp with so many worlds
+    worlds: of env steps of Playground's tasks, each number that is tried
     mjx: the episodes of plain MJX, each number that is tried
     mjx_steps: their env steps
     warp: the worlds of MuJoCo Warp, each number that is tried
@@ -58,6 +60,7 @@ class Sizes(NamedTuple):
     mjx_steps: int = 0
     warp: tuple[int, ...] = (8_192, 32_768)
     few: tuple[int, ...] = ()
+    worlds: tuple[int, ...] = ()
 
 
 #: A task of a user's own, and the same with elliptic cones.
@@ -65,6 +68,8 @@ QUADRUPED = "experiments.examples.quadruped:Quadruped"
 ELLIPTIC = "experiments.speed.benchmark.robots:EllipticQuadruped"
 #: Of a task that is not in ``GPU``.
 OTHER = Sizes(33_792, 200, few=(2_048,))
+#: Of a task of MuJoCo Playground, whose own env step is the peer.
+OF_PLAYGROUND = Sizes(33_792, 200, warp=(), worlds=(2_048, 8_192, 32_768))
 #: What stands first is timed first, and so kept where a call is cut off.
 GPU = {
     "InvertedPendulum-v5": Sizes(262_144, 200, (16_384, 65_536), 50, (32_768, 131_072)),
@@ -279,10 +284,13 @@ def on_gpu(task: str, settings: Settings) -> Callable[[], list[Candidate]]:
     from experiments.speed.benchmark.ours import rollout_of, rollouts
     from experiments.speed.benchmark.peers import c_mujoco
 
-    sizes = GPU.get(task, OTHER)
+    of_playground = task.startswith("playground:")
+    sizes = GPU.get(task, OF_PLAYGROUND if of_playground else OTHER)
     if settings.batches:
         steps = settings.steps or sizes.steps
         sizes = Sizes(settings.batches[-1], steps, warp=(), few=settings.batches[:-1])
+        if of_playground:
+            sizes = sizes._replace(few=(), worlds=settings.batches)
     native = []
     for run in (None, *settings.runs):
         try:
@@ -293,7 +301,13 @@ def on_gpu(task: str, settings: Settings) -> Callable[[], list[Candidate]]:
         rollout(128).run()  # the machine code is the same for any number of episodes
     plain = [batch // settings.shrink for batch in sizes.mjx]
     others = rollouts(task, "plain MJX", plain, sizes.mjx_steps) if plain else []
-    worlds = settings.batches or (*sizes.few, *sizes.warp)
+    env_steps: Callable[[], list[Candidate]] = list
+    if of_playground:
+        from experiments.speed.benchmark import playground
+
+        numbers = tuple(max(1, number // settings.shrink) for number in sizes.worlds)
+        env_steps = partial(playground.candidates, playground.compiled(task, numbers))
+    worlds = () if of_playground else settings.batches or (*sizes.few, *sizes.warp)
     if worlds:
         added(task, 128)  # compiles
     if sizes.warp:
@@ -301,7 +315,7 @@ def on_gpu(task: str, settings: Settings) -> Callable[[], list[Candidate]]:
 
     def candidates() -> list[Candidate]:
         batches = [max(1, batch // settings.shrink) for batch in (*sizes.few, sizes.batch)]
-        ours = [rollout(batch) for rollout in native for batch in batches]
+        ours = [rollout(batch) for rollout in native for batch in batches] + env_steps()
         numbers = [max(1, number // settings.shrink) for number in worlds]
         return sum((added(task, number) for number in numbers), ours + others)
 

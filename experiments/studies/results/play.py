@@ -1,6 +1,5 @@
 """The best and the median policy of every task in Gymnasium and in our simulation, and films."""
 
-import functools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from experiments.kit.episodes import own_simulation
 from experiments.studies.results.films import save
 from experiments.studies.results.kept import POLICIES, write_played
 from experiments.studies.results.runs import ended
@@ -48,46 +48,6 @@ def play(tasks: Iterable[Task], directory: Path, films: Path, num_episodes: int)
             film = films / f"{task.name}-best.gif" if policy == "best" else None
             rows += _play(run, policy, num_episodes, ours, film)
         write_played(path, rows)
-
-
-def own_simulation(run: Run, player: Player, num_episodes: int) -> Any:
-    """Returns a function from an actor to the returns [N] of episodes without noise.
-
-    Args:
-      run: gives the task and its time limit.
-      player: whose policy the actors are of.
-      num_episodes: N.
-
-    Returns:
-      (actor, root of all randomness of the starts) -> returns [N].
-    """
-    import jax
-
-    from mjx_reinforce.engine.play import choice
-    from mjx_reinforce.engine.play.rollouts import episode_returns
-    from mjx_reinforce.learning.policy import act
-
-    env, policy = envs.make(run.env), player.policy
-    whose = choice.ActingPolicy(functools.partial(act, policy), player.actor, policy.distribution)
-    engine = choice.choose("auto", env, whose, run.horizon)
-
-    @jax.jit
-    def returns(actor, root):
-        return episode_returns(
-            engine.rollout(
-                env,
-                whose.act,
-                actor,
-                policy.distribution,
-                # Training and its evaluations split the keys of their roots; this is not split.
-                jax.random.key(root),
-                num_episodes=num_episodes,
-                horizon=run.horizon,
-                deterministic=True,
-            )
-        )
-
-    return returns
 
 
 def _play(

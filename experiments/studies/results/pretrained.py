@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from scipy import stats
 
-from experiments.studies.results.play import own_simulation
+from experiments.kit.episodes import own_simulation
 from experiments.studies.results.runs import ended
 from mjx_reinforce import envs
 from mjx_reinforce.console.jax_setup import configure_jax

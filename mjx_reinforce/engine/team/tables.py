@@ -830,6 +830,8 @@ class _Tables:
         has_meshes = MESH in types
         self.reals["geom_turn"] = turns if has_size or has_meshes else []
         self.reals["geom_size"] = size if has_size else []
+        has_convex = self.constants["CONVEX_CONTACTS"] > 0
+        self.reals["geom_box"] = model.geom_aabb[geoms] if has_convex else []
         self.hulls = hulls.of_geoms(model, geoms)
         meshes = model.geom_dataid[geoms]
         numbers = [self.hulls.numbers.get(int(x), -1) for x in meshes]

@@ -295,16 +295,50 @@ def test_what_an_episode_draws_of_its_model_is_drawn_where_it_begins(monkeypatch
     assert "draw(M, s, " not in step
 
 
-def test_starts_that_show_positions_alone_are_those_of_teams(monkeypatch):
-    """MJX finds no contacts of these geoms, and C MuJoCo would be the fastest but for teams."""
-    cylinders = LEG.replace('type="capsule"', 'type="cylinder"').replace(
-        "</worldbody>",
-        '<body pos=".3 0 .2"><freejoint/><geom type="cylinder" size=".1 .1"/></body></worldbody>',
-    )
-    spec = mujoco.MjSpec.from_string(cylinders)
-    env = StillLeg(xml_file=spec, frame_skip=2, max_episode_steps=30, reward_threshold=None)
+def cylinders(task):
+    """Returns a task on a leg of cylinders, for which C MuJoCo would be the fastest but for teams.
+
+    MJX finds no contacts of these geoms.
+    """
+    more = """
+        <body pos=".3 0 .2">
+          <joint type="slide" axis="0 0 1"/><joint type="slide" axis="1 0 0"/>
+          <geom type="cylinder" size=".1 .1"/>
+        </body>
+      </worldbody>"""
+    xml = LEG.replace('type="capsule"', 'type="cylinder"').replace("</worldbody>", more)
+    spec = mujoco.MjSpec.from_string(xml)
+    env = task(xml_file=spec, frame_skip=2, max_episode_steps=30, reward_threshold=None)
     assert env.best_in_c_mujoco
+    return env
+
+
+class CylinderLeg(Leg):
+    """A leg beside something that falls."""
+
+    def initial(self, rng):
+        qpos, qvel = super().initial(rng)
+        return jnp.append(qpos, jnp.zeros(2)), jnp.append(qvel, jnp.array([0.0, -0.1]))
+
+
+def test_starts_that_show_positions_alone_are_those_of_teams(monkeypatch):
+    env = cylinders(StillLeg)
     assert ["t.meet(" in text for text in kernels(monkeypatch, env)] == [True, True]
+
+
+@pytest.mark.slow
+def test_teams_show_sensors_of_models_that_mjx_refuses(teams):
+    env = cylinders(CylinderLeg)
+    actor, act, distribution = player = actor_and_act(env, (5,))
+    policy = choice.ActingPolicy(act, actor, distribution)
+    want = played(choice.choose("mujoco", env, policy, 30).rollout, env, player, num_seeds=2)
+    made = teams()
+    got = played(native.native_rollout, env, player, num_seeds=2)
+    assert [kernel.launch.lanes for kernel in made] == [16, 16]
+    for name in ("observation", "action", "reward"):
+        pair = (getattr(x, name)[:, :20] for x in (got, want))
+        np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
+    assert (want.observation[..., 9] > 0).any()  # touch
 
 
 def test_lanes_share_what_few_numbers_cost():

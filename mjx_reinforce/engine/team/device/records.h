@@ -53,6 +53,8 @@ struct FluidBody {
 struct Compensation { real moment[3], mass; };
 // Along the two tangents, about the normal, about the two tangents.
 struct Friction { real along[5]; };
+// A box around a geom, in the geom's frame.
+struct GeomBox { real center[3], half[3]; };
 
 // The hull of a mesh, in memory that all teams read (hulls.py). What has no room in a struct is a
 // list from its place in hull_neighbor, hull_faces_of or hull_corner on; the first two end with -1.

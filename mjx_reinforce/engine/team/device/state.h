@@ -111,4 +111,5 @@ struct alignas(4 * sizeof(real)) State : Drawn {
   Contact* far;         // [FAR], in memory that the launcher gives
   int num_contacts;
   int queue[2 * W];
+  Some<int, CONVEX_CONTACTS ? 2 * W : 0> meeting;  // another queue
 };

@@ -1,0 +1,96 @@
+"""Tasks of MuJoCo Playground's suite, trained for minutes: the tables of docs/playground.md.
+
+    python -m experiments.studies.playground train DIR --minutes 1    # DIR/TASK, DIR/returns
+    python -m experiments.studies.playground train DIR --minutes 8    # the same runs go on
+    python -m experiments.studies.playground agree DIR                # DIR/agreement.csv
+    python -m experiments.studies.playground keep DIR                 # data, of both
+    python -m experiments.studies.playground page                     # the tables, from data
+
+``--minutes`` is for all seeds of a task together, evaluations included; compiling and the test at
+the end come on top. Of several GPUs, give each a process of its own (CUDA_VISIBLE_DEVICES) and a
+share of the tasks. Tasks follow one another; what is there is kept, and what was stopped (Ctrl-C,
+or ``timeout -s INT 570 python ...``) goes on.
+"""
+
+import argparse
+import sys
+from functools import partial
+from pathlib import Path
+
+from experiments.kit import rows
+from experiments.kit.markdown import filled
+from experiments.kit.places import DOCS
+
+DATA = Path(__file__).parent / "data"
+
+
+def main() -> int:
+    """Reads the command line, does what it says, and returns the exit status."""
+    parser = argparse.ArgumentParser(
+        prog="python -m experiments.studies.playground",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("stage", choices=("train", "agree", "keep", "page"))
+    parser.add_argument("directory", type=Path, nargs="?", help="of all stages but page")
+    parser.add_argument("--tasks", nargs="+", help="names of the suite; by default the twenty")
+    parser.add_argument("--num-seeds", type=int, default=8)
+    parser.add_argument("--minutes", type=float, default=1.0, help="of a task, all seeds together")
+    parser.add_argument("--episodes", type=int, default=100, help="of each side of agree")
+    parser.add_argument("--impl", choices=("jax", "warp"), default="jax", help="of agree")
+    arguments = parser.parse_args()
+    if arguments.directory is None and arguments.stage != "page":
+        parser.error(f"{arguments.stage} needs a directory")
+    directory = Path(arguments.directory or "")
+    if arguments.stage == "page":
+        write(DATA, DOCS / "playground.md")
+        return 0
+    if arguments.stage == "keep":
+        keep(directory, DATA)
+        return 0
+    from experiments.studies.playground import runs
+
+    tasks = arguments.tasks or runs.TASKS
+    if arguments.stage == "train":
+        return not runs.train(tasks, directory, arguments.num_seeds, arguments.minutes)
+    from experiments.studies.playground import agreement
+
+    agreement.compare(tasks, directory, arguments.episodes, arguments.impl)
+    return 0
+
+
+def keep(directory: Path, data: Path) -> None:
+    """Adds the returns of a directory to the data, in place of those of the same runs."""
+    from experiments.studies.playground import tables
+
+    sources = {
+        tables.RETURNS: sorted(directory.glob("returns/*.csv")),
+        tables.AGREEMENT: sorted(directory.glob("agreement.csv")),
+    }
+    for name, paths in sources.items():
+        new = [row for path in paths for row in rows.read(path)]
+        keys = {_key(row) for row in new}
+        old = rows.read(data / name) if (data / name).exists() else []
+        lines = [row for row in old if _key(row) not in keys] + new
+        if lines:
+            rows.write(data / name, lines)
+
+
+def _key(row: dict[str, str]) -> tuple[str, ...]:
+    """Returns which run a row is of; of one task, another device replaces what is there."""
+    return row["task"], row.get("minutes", "")
+
+
+def write(data: Path, page: Path) -> None:
+    """Writes the tables of the page again, between their marks."""
+    from experiments.studies.playground import tables
+
+    made = {
+        "returns": partial(tables.returns, data),
+        "agreement": partial(tables.agreement, data),
+    }
+    page.write_text(filled(page.read_text("utf-8"), made), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

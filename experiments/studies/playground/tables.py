@@ -1,0 +1,117 @@
+"""The tables of docs/playground.md: returns after minutes of training beside published ones."""
+
+import itertools
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from experiments.kit.markdown import fixed, table
+from experiments.kit.rows import read
+from experiments.studies.playground.runs import TASKS
+from experiments.studies.results.tables import compare, estimate, number
+from mjx_reinforce.statistics import estimate_mean
+
+RETURNS, AGREEMENT, PUBLISHED = "returns.csv", "agreement.csv", "published.csv"
+
+
+class Result(NamedTuple):
+    """A run: its task, its budget of all seeds together (min), and what its rows say.
+
+    returns: [S] of the seeds' policies, each a mean over fresh episodes
+    """
+
+    task: str
+    minutes: float
+    device: str
+    returns: np.ndarray
+    env_steps: float
+    seconds: float
+
+
+def results(data: Path) -> list[Result]:
+    """Returns the runs of the data, by task and budget."""
+    path = data / RETURNS
+    lines = read(path) if path.exists() else []
+    lines.sort(key=lambda row: (TASKS.index(row["task"]), float(row["minutes"])))
+    return [
+        Result(
+            task=task,
+            minutes=float(minutes),
+            device=mine[0]["device"],
+            returns=_numbers(mine, "return"),
+            env_steps=float(np.mean(_numbers(mine, "env_steps"))),
+            seconds=float(mine[0]["seconds"]),
+        )
+        for (task, minutes), group in itertools.groupby(
+            lines, lambda row: (row["task"], row["minutes"])
+        )
+        for mine in [list(group)]
+    ]
+
+
+def _numbers(lines: Iterable[dict[str, Any]], column: str) -> np.ndarray:
+    return np.array([float(row[column]) for row in lines])
+
+
+def _published(data: Path) -> dict[str, dict[str, float]]:
+    """Returns published mean returns: by column, by task."""
+    columns: dict[str, dict[str, float]] = {}
+    for row in read(data / PUBLISHED):
+        column = f"{row['algorithm']}, {float(row['env_steps']):.0e}".replace("e+0", "e")
+        columns.setdefault(column, {})[row["task"]] = float(row["mean"])
+    return columns
+
+
+def returns(data: Path) -> str:
+    """Returns the table of all tasks, with a last row of means."""
+    published = _published(data)
+    measured = results(data)
+    header = ["task", "on", "minutes", "mean (95%)", "worst seed", "seconds", "env steps a seed"]
+    lines = [
+        [
+            result.task,
+            result.device.removeprefix("NVIDIA "),
+            f"{result.minutes:g}",
+            estimate(estimate_mean(result.returns)),
+            number(float(result.returns.min())),
+            f"{result.seconds:.0f}",
+            f"{result.env_steps:.1e}".replace("e+0", "e").replace("e+", "e"),
+            *(_cell(column.get(result.task)) for column in published.values()),
+        ]
+        for result in measured
+    ]
+    for minutes in sorted({result.minutes for result in measured}):
+        mine = [result for result in measured if result.minutes == minutes]
+        mean = float(np.mean([result.returns.mean() for result in mine]))
+        means = [
+            float(np.mean([column[x.task] for x in mine if x.task in column] or [np.nan]))
+            for column in published.values()
+        ]
+        label = f"mean of {len(mine)} tasks"
+        lines.append(
+            [label, "", f"{minutes:g}", number(mean), "", "", "", *(fixed(x, 0) for x in means)]
+        )
+    return table([*header, *published], lines)
+
+
+def _cell(mean: float | None) -> str:
+    return "" if mean is None else fixed(mean, 0)
+
+
+def agreement(data: Path) -> str:
+    """Returns the table of the same policies here and on Playground's own environments."""
+    path = data / AGREEMENT
+    lines = read(path) if path.exists() else []
+    cells: list[Sequence[str]] = []
+    for task in TASKS:
+        mine = [row for row in lines if row["task"] == task]
+        ours = _numbers((x for x in mine if x["implementation"] == "ours"), "return")
+        theirs = _numbers((x for x in mine if x["implementation"] != "ours"), "return")
+        if not mine:
+            continue
+        means = (number(float(x.mean())) for x in (ours, theirs))
+        label = f"{task} (seed {mine[0]['seed']})"
+        cells.append([label, str(len(ours)), *means, estimate(compare(ours, theirs))])
+    return table(["task", "episodes", "here", "Playground", "Playground less here (95%)"], cells)

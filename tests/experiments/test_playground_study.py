@@ -1,0 +1,83 @@
+"""The study of Playground's suite: what its tables say of made-up runs, and how a run goes on."""
+
+import numpy as np
+import pytest
+
+from experiments.kit import rows
+from experiments.studies.playground import __main__ as study
+from experiments.studies.playground import runs, tables
+
+RUN = {"date": "", "commit": "", "device": "NVIDIA X", "jax": "", "status": "finished"}
+
+
+def write_run(folder, task, minutes, returns):
+    known = RUN | {"task": task, "minutes": f"{minutes:g}", "seconds": "58.2"}
+    known |= {"env_steps": "2500000", "compile_seconds": "15.0"}
+    lines = [known | {"seed": i, "return": x} for i, x in enumerate(returns)]
+    rows.append(runs.returns_path(folder, task, minutes), lines, runs.COLUMNS)
+
+
+def write_episodes(folder, task, ours, theirs):
+    known = {"date": "", "commit": "", "device": "", "jax": "", "task": task, "seed": 3}
+    lines = [
+        known | {"implementation": name, "episode": i, "return": x}
+        for name, numbers in (("ours", ours), ("jax", theirs))
+        for i, x in enumerate(numbers)
+    ]
+    columns = [*known, "implementation", "episode", "return"]
+    rows.append(folder / "agreement.csv", lines, columns)
+
+
+def test_a_page_is_made_of_what_is_kept(tmp_path):
+    data = tmp_path / "data"
+    data.mkdir()
+    (data / "published.csv").write_bytes((study.DATA / "published.csv").read_bytes())
+    page = tmp_path / "page.md"
+    marks = "<!-- not run: a comment -->\n"  # that has no end
+    marks += "<!-- returns -->\n<!-- end -->\n<!-- agreement -->\n<!-- end -->\n"
+    page.write_text(marks)
+    write_run(tmp_path / "one", "HopperHop", 1, [10.0, 20.0, 30.0, 40.0, 50.0, 60.0])
+    write_run(tmp_path / "one", "WalkerRun", 1, [700.0] * 8)
+    write_run(tmp_path / "one", "WalkerRun", 8, [800.0] * 8)
+    write_episodes(tmp_path / "one", "WalkerRun", [1.0, 2.0, 3.0], [2.0, 3.0, 4.0])
+    study.keep(tmp_path / "one", data)
+    study.write(data, page)
+    lines = page.read_text().splitlines()
+    walker, _, hopper = (x for x in lines if x.startswith(("| WalkerRun |", "| HopperHop |")))
+    assert "| X | 1 | 700.0 (no interval) | 700.0 | 58 | 2.5e6 | 470 | 601 | 711 |" in walker
+    assert "| 1 | 35.0 (" in hopper
+    assert hopper.endswith("| 10.0 | 58 | 2.5e6 | 2 | 2 | 122 | 61 | 188 |")
+    # Means are over the tasks that have a figure: of REPPO (896 + 188) / 2.
+    assert "| mean of 2 tasks |  | 1 | 367.5 |  |  |  | 236 | 302 | 416 | 446 | 542 |" in lines
+    assert any(x.startswith("| WalkerRun (seed 3) | 3 | 2.00 | 3.00 | 1.00 (") for x in lines)
+    # A run that is kept again replaces what is there.
+    write_run(tmp_path / "two", "HopperHop", 1, [1.0] * 8)
+    study.keep(tmp_path / "two", data)
+    study.write(data, page)
+    assert sum(x.startswith("| HopperHop |") for x in page.read_text().splitlines()) == 1
+    assert len(tables.results(data)) == 3
+
+
+def test_every_task_has_published_figures():
+    published = rows.read(study.DATA / "published.csv")
+    assert {row["task"] for row in published} == set(runs.TASKS)
+    assert all(0 <= float(row["mean"]) <= 1000 for row in published)
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_for_more_minutes_and_is_not_repeated(tmp_path, capsys):
+    pytest.importorskip("mujoco_playground")
+    tasks = ["NoSuchTask", "PendulumSwingup"]
+    assert not runs.train(tasks, tmp_path, num_seeds=2, minutes=0.02)
+    said = capsys.readouterr().out
+    assert "NoSuchTask: failed" in said
+    first = rows.read(runs.returns_path(tmp_path, "PendulumSwingup", 0.02))
+    assert [row["seed"] for row in first] == ["0", "1"]
+    assert all(0 <= float(row["return"]) <= 1000 for row in first)
+    assert runs.train(tasks[1:], tmp_path, num_seeds=2, minutes=0.02)
+    assert "is there" in capsys.readouterr().out
+    assert runs.train(tasks[1:], tmp_path, num_seeds=2, minutes=0.1)
+    second = rows.read(runs.returns_path(tmp_path, "PendulumSwingup", 0.1))
+    steps = [np.array([float(row["env_steps"]) for row in x]) for x in (first, second)]
+    assert (steps[1] > steps[0]).all()
+    assert float(second[0]["seconds"]) > float(first[0]["seconds"])
