@@ -164,6 +164,11 @@ def check_each(config: Config) -> None:
             f"--seeds {config.seeds} names {len(read_seeds(config.seeds))} seeds, and num_seeds is "
             f"{config.num_seeds}: make them agree"
         )
+    if len(config.budgets) % 2 or not all(0 <= x <= MAX_COUNT for x in config.budgets):
+        raise ValueError(
+            "--budgets must be pairs of an update and env steps, from 0 to 2^53, got "
+            f"{config.budgets}"
+        )
     # Before hours of training, and not where the first row is logged.
     for name in config.log:
         _check_installed(name)
