@@ -81,6 +81,12 @@ def settings_in_words(settings: Mapping[str, Any]) -> str:
     return ", ".join(f"{setting_in_words(name)} {say(value)}" for name, value in settings.items())
 
 
+def race_in_words(settings: Mapping[str, Any]) -> str:
+    """Returns what a label says of a race among the settings, ", race 4"; nothing without one."""
+    race = settings.get("race") or 1
+    return f", race {race}" if race > 1 else ""
+
+
 def setting_in_words(name: str) -> str:
     """Returns the name of a setting in words."""
     return name.replace("_", " ")

@@ -19,6 +19,7 @@ from mjx_reinforce.reports.experiment import (
     Source,
     counted,
     lengthened,
+    race_in_words,
     setting_in_words,
     settings_in_words,
 )
@@ -218,6 +219,9 @@ def _told_apart(sources: Sequence[Source]) -> list[Configuration]:
         if not label:
             # A run by itself is its task; several of one task are told by their directories.
             label = source.env if len(pairs) == 1 else _path_in_words(source.directory.name)
+        # Nor does a mean of races stand anywhere without its label.
+        if "race" not in differences:
+            label += race_in_words(settings)
         parts.append(part._replace(settings=differences, label=label))
     # Charts and tables know a configuration by its label alone: no two may be equal.
     times = Counter(part.label for part in parts)
@@ -321,7 +325,8 @@ def _read_run(directory: Path, config: dict[str, Any]) -> Source:
         directory=directory,
         env=config["env"],
         configurations=[part],
-        settings={name: value for name, value in config.items() if name not in PROVENANCE},
+        # Runs of earlier versions of the package do not race, and do not say so.
+        settings={"race": 1} | {name: x for name, x in config.items() if name not in PROVENANCE},
         provenance=provenance,
         **outcome,
     )

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_reinforce.reports import charts
+from mjx_reinforce.reports.experiment import race_in_words
 from mjx_reinforce.reports.findings import Findings, Result
 from mjx_reinforce.statistics import Estimate
 from mjx_reinforce.statistics.tasks import iqm_of_tasks, mean_of_tasks, performance_profile
@@ -118,7 +119,8 @@ def _are_lone(tasks: Sequence[Findings]) -> bool:
 def _by_label(findings: Findings, *, lone: bool) -> dict[str, Result]:
     """Returns the results of a task by their labels; a lone one is called by its task there."""
     if lone:
-        return {_LONE_LABEL: findings.results[0]}
+        label = _LONE_LABEL + race_in_words(findings.experiment.settings)
+        return {label: findings.results[0]}
     return dict(zip(findings.labels, findings.results, strict=True))
 
 

@@ -5,7 +5,14 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from mjx_reinforce.reports.experiment import Experiment, counted, ordered, say, setting_in_words
+from mjx_reinforce.reports.experiment import (
+    Experiment,
+    counted,
+    ordered,
+    race_in_words,
+    say,
+    setting_in_words,
+)
 from mjx_reinforce.reports.findings import COMPARED, Findings, by_speed, lost_by_lot
 from mjx_reinforce.reports.tasks import TaskFindings
 from mjx_reinforce.settings.defaults import OF_TASKS
@@ -326,6 +333,7 @@ def caveats(findings: Findings) -> Iterator[str]:
         yield f"{directory} is not finished. These are its results so far."
     for name in map(setting_in_words, experiment.disagree):
         yield f'The sources were made with different {name}: see "Where this comes from".'
+    yield from _raced(experiment)
     if min(sizes) < _FEW_SEEDS:
         yield (
             f"A configuration has {counted(min(sizes), 'seed')}: with fewer than {_FEW_SEEDS}, "
@@ -375,6 +383,17 @@ def caveats(findings: Findings) -> Iterator[str]:
     if _rises(results[0].band):
         yield "The best was still rising at the end. A longer training may change the order."
     yield "This is one task. Nothing here says how these settings do on another."
+
+
+def _raced(experiment: Experiment) -> Iterator[str]:
+    """Yields which configurations are races, whose means are none of single seeds."""
+    for part in experiment.configurations:
+        if race_in_words(experiment.settings | part.settings):
+            yield (
+                f"Each seed of {part.label} is the best of a race: of several policies, those with "
+                "worse training returns were dropped. A seed without a race is no such choice. Env "
+                "steps count all policies of a race."
+            )
 
 
 def _edges(findings: Findings) -> Iterator[str]:

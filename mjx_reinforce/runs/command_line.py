@@ -34,9 +34,9 @@ _TRAIN = (
     "Train policies by REINFORCE on MuJoCo, many seeds at once, and report over the seeds. Writes "
     "config.json, metrics.csv, returns.npz, summary.json, learning_curve.png, policy/, checkpoint/ "
     "into the run directory.\n\n"
-    "Defaults depend on the task and on the budget. --help shows those of InvertedPendulum-v5 for "
-    "about a minute of training on this machine. --help --env ID shows those of another task, and "
-    "with --env-steps N those for N env steps."
+    "Defaults depend on the task and on the budget. --help shows those of InvertedPendulum-v5. "
+    "--help --env ID shows those of another task, which most train for a minute, and with "
+    "--env-steps N those for N env steps."
 )
 _SWEEP = (
     "Train many configurations, many seeds of each, side by side. Writes sweep.json, curves.npz, "
@@ -64,7 +64,7 @@ def parse(arguments: Sequence[str], name: str = "train") -> Design:
         or what is to go on is not there, has other settings, was stopped, or is of the user's own
         code, which is to be named again.
     """
-    default, flags, prog = start(arguments, command(name))
+    default, flags, prog = start(arguments, command(name), timed=name == "train")
     base, sweep = _read(name, flags, default, prog)
     if base.minutes is not None and flag_value(flags, "--env-steps"):
         raise ValueError(
@@ -110,12 +110,15 @@ def parse(arguments: Sequence[str], name: str = "train") -> Design:
     return dataclasses.replace(design, base=base, default=design.base)
 
 
-def start(arguments: Sequence[str], prog: str) -> tuple[Config, Sequence[str], str]:
+def start(
+    arguments: Sequence[str], prog: str, *, timed: bool = False
+) -> tuple[Config, Sequence[str], str]:
     """Reads the preset of a command line.
 
     Args:
       arguments: a preset's name, if any, then flags.
       prog: the name of the program, for --help.
+      timed: see ``defaults.for_arguments``.
 
     Returns:
       The default settings, the flags, and the program with its preset.
@@ -124,7 +127,7 @@ def start(arguments: Sequence[str], prog: str) -> tuple[Config, Sequence[str], s
       ValueError: there is no such preset, or it stands beside a run that has all settings.
     """
     if not arguments or arguments[0].startswith("-"):
-        return _default(arguments), arguments, f"{prog} [PRESET]"
+        return _default(arguments, timed=timed), arguments, f"{prog} [PRESET]"
     preset, *flags = arguments
     if preset not in PRESETS:
         raise ValueError(about_word(preset))
@@ -134,10 +137,10 @@ def start(arguments: Sequence[str], prog: str) -> tuple[Config, Sequence[str], s
     return PRESETS[preset][1], flags, f"{prog} {preset}"
 
 
-def _default(arguments: Sequence[str]) -> Config:
+def _default(arguments: Sequence[str], *, timed: bool) -> Config:
     """Returns the settings that hold where the user gives none: a task's, or those of a run."""
     if not (like := flag_value(arguments, "--like")):
-        return for_arguments(arguments)
+        return for_arguments(arguments, timed=timed)
     directory = Path(os.path.expanduser(like))
     if not (directory / "config.json").is_file():
         raise ValueError(f"--like {like}: there is no run, for it has no config.json")

@@ -135,7 +135,8 @@ def _begin(
     """
     group = group_plan.group
     # The number of seeds is here that of the chunk's runs, whatever configuration each is of.
-    config = dataclasses.replace(group.config, num_seeds=len(runs.seed))
+    num_seeds = len(runs.seed) // group.config.race
+    config = dataclasses.replace(group.config, num_seeds=num_seeds)
     settings = {name: values[runs.member] for name, values in group.settings.items()}
     slots = Slots(compiled_programs, runs.seed, settings)
     if plan.design.is_sweep:

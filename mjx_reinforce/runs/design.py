@@ -157,12 +157,12 @@ def check_design(design: Design) -> None:
         _check_sweep(design)
     check_each(design.base)
     # By the count alone: ``design.configs`` below would itself fill the memory.
-    num_runs = design.count() * design.base.num_seeds
+    num_runs = design.count() * design.base.num_policies
     if num_runs * _RESULT_BYTES > host_memory():
         raise ValueError(
             f"the results of {num_runs:,} runs do not fit into memory: they need about "
             f"{gigabytes(num_runs * _RESULT_BYTES)}, {gigabytes(host_memory())} are here; lower "
-            "--num-seeds or the number of values after --over"
+            "--num-seeds, --race or the number of values after --over"
         )
     for config, configuration in zip(design.configs, design.configurations, strict=True):
         check(config)
@@ -176,8 +176,8 @@ def check_design(design: Design) -> None:
 
 def _check_sweep(design: Design) -> None:
     """Raises ValueError for what makes no sense in a sweep."""
-    for name in ("minutes", "init_from"):
-        if getattr(design.base, name) is not None:
+    for name in ("minutes", "init_from", "race"):
+        if getattr(design.base, name) != getattr(Config, name):
             raise ValueError(f"{flag(name)} is for one run, not for a sweep: leave it out")
     if design.chunk_runs is not None and design.chunk_runs < 1:
         raise ValueError(f"--chunk-runs must be at least 1, got {design.chunk_runs}")

@@ -250,6 +250,12 @@ def summary_table(summary: dict[str, Any]) -> Table:
     """Returns the table that ends a run."""
     num_seeds = f"{summary['num_seeds']:,}"
     table = Table(title=f"{summary['env']}, {num_seeds} seeds", show_header=False)
+    if summary["race"] > 1:
+        table.caption = (
+            f"Each seed is the best of a race of {summary['race']} policies, by training returns; "
+            f"all policies together played {sum(summary['env_steps']):,} env steps in "
+            f"{summary['run_seconds']:,.1f} s."
+        )
     low, high = summary["iqm_ci"]
     if math.isfinite(low) and math.isfinite(high):
         interval = f"95% interval {low:.1f} to {high:.1f}"

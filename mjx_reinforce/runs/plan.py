@@ -47,8 +47,8 @@ class Group(NamedTuple):
 
     @property
     def num_runs(self) -> int:
-        """How many runs it has: each configuration has as many seeds."""
-        return len(self.members) * self.config.num_seeds
+        """How many runs it has: each configuration has as many seeds, and each of these a race."""
+        return len(self.members) * self.config.num_policies
 
 
 class GroupPlan(NamedTuple):
@@ -142,8 +142,8 @@ def make_plan(
     group_plan = GroupPlan(
         group=group,
         ready=ready_programs,
-        limit=config.num_seeds,
-        width=division.capacity(config.num_seeds),
+        limit=config.num_policies,
+        width=division.capacity(config.num_policies),
         stages=[split_runs(group, "000", 1)],
     )
     return Plan(design, [group_plan], division, saved_record, checkpoint, actors, clock)
@@ -164,7 +164,7 @@ def divide_run(config: Config) -> Division:
       config: its settings.
     """
     num_devices = jax.local_device_count()
-    num_seeds = config.num_seeds
+    num_seeds = config.num_policies
     # Seeds a device, and from that the devices: of 5 seeds on 4 devices two each, on three.
     seeds_per_device = -(-num_seeds // num_devices)
     seed_division = Division(seeds=-(-num_seeds // seeds_per_device))
@@ -357,9 +357,10 @@ def split_runs(group: Group, name: str, num_chunks: int) -> list[Runs]:
     """
     num_runs = group.num_runs
     chunk_size = -(-num_runs // num_chunks)
-    # Run i has seed i // C of configuration i % C, where the group has C configurations.
+    # Run i has seed i // C of configuration i % C, where the group has C configurations. A race of
+    # K policies takes K seeds: that of seed n those from K n on, whatever seeds are beside it.
     seed, member_index = np.divmod(np.arange(num_runs), len(group.members))
-    seed += group.config.first_seed
+    seed += group.config.first_seed * group.config.race
     chunks = []
     for chunk_number, first_run in enumerate(range(0, num_runs, chunk_size)):
         chunk_members = member_index[first_run : first_run + chunk_size]
@@ -395,6 +396,8 @@ def describe(plan: Plan) -> str:
     config = group_plans[0].group.config
     ready_programs = group_plans[0].ready
     plan_subject = f"{counted(config.num_seeds, 'seed')} of {config.env}"
+    if config.race > 1:
+        plan_subject += f", in races of {config.race} policies each,"
     programs = ""
     if plan.design.is_sweep:
         chunk_sizes = [len(runs.seed) for group_plan in group_plans for runs in group_plan.chunks]

@@ -166,8 +166,8 @@ def run(
         test_returns=np.asarray(summary["final_test_returns"]),
         best_test_returns=np.asarray(summary["best_test_returns"]),
         policy=played_policy(outcome.policy),
-        actor=driver.states.train_states.actor,
-        best=driver.best.actor,
+        actor=driver.last_actors(),
+        best=driver.best_actors(),
         summary=summary,
     )
 

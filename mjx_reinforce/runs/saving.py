@@ -227,8 +227,14 @@ class RunFiles(Files[RunDriver]):
         settings = dataclasses.asdict(config) | {"output": str(self._directory)}
         del settings["resume"]
         played_by = {"played_by": self._plan.group_plans[0].ready.engine}
-        self._write_json("config.json", settings | played_by | provenance())
+        self.contents = settings | played_by | provenance()
+        self._write_config(config)
         write_bytes(self._metrics, header(self._plan.group_plans[0].ready.terms))
+
+    def _write_config(self, config: Config) -> None:
+        """Writes config.json with the present budgets."""
+        self.contents |= {name: getattr(config, name) for name in resume.BUDGETS}
+        self._write_json("config.json", self.contents)
 
     def _take_back(self, driver: RunDriver, checkpoint: Checkpoint | None) -> None:
         """Takes the files back to a checkpoint, and says in config.json that the run goes on.
@@ -239,11 +245,10 @@ class RunFiles(Files[RunDriver]):
         run_progress = {
             "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "updates": driver.updates(),
-            "env_steps": int(driver.record.env_steps.sum()),
+            "env_steps": int(driver.record.played_steps().sum()),
         }
-        budgets = {name: getattr(driver.config, name) for name in resume.BUDGETS}
-        resumed = [*self.contents.get("resumed", []), run_progress]
-        self._write_json("config.json", self.contents | budgets | {"resumed": resumed})
+        self.contents["resumed"] = [*self.contents.get("resumed", []), run_progress]
+        self._write_config(driver.config)
         self._write_json("summary.json", {"status": "running", **run_progress})
         if checkpoint is None:
             resume.remove_checkpoints(self._checkpoints, last_number=0)
@@ -282,13 +287,16 @@ class RunFiles(Files[RunDriver]):
             "env": driver.config.env,
             "num_seeds": driver.config.num_seeds,
             "updates": driver.updates(),
-            "env_steps": int(driver.record.env_steps.sum()),
+            "env_steps": int(driver.record.played_steps().sum()),
         }
         self._attempt("summary.json", lambda: self._write_json("summary.json", run_progress))
 
     def _save_checkpoint(self, driver: RunDriver) -> None:
         """Writes a checkpoint, which says how long metrics.csv is with all rows in it."""
         self._write_rows()
+        # First, as it chooses the checkpoint.
+        if tuple(self.contents["budgets"]) != driver.config.budgets:
+            self._write_config(driver.config)
         checkpoint = driver.checkpoint()._replace(metrics_bytes=self._metrics.stat().st_size)
         resume.save(
             self._checkpoints, checkpoint, is_even=checkpoint.is_even(driver.config.eval_every)
@@ -297,8 +305,8 @@ class RunFiles(Files[RunDriver]):
     def _save_policies(self, driver: RunDriver) -> None:
         """Writes the last and the best policies."""
         settings = self._plan.group_plans[0].ready.policy
-        save_policy(self._folder("policy"), driver.states.train_states.actor, settings)
-        save_policy(self._folder("policy", "best"), driver.best.actor, settings)
+        save_policy(self._folder("policy"), driver.last_actors(), settings)
+        save_policy(self._folder("policy", "best"), driver.best_actors(), settings)
 
     def _write_rows(self) -> None:
         """Appends to metrics.csv the rows that it lacks."""

@@ -69,6 +69,11 @@ class Config(
         return read_seeds(self.seeds).start
 
     @property
+    def num_policies(self) -> int:
+        """How many policies are trained side by side: those that race, of all seeds."""
+        return self.num_seeds * self.race
+
+    @property
     def episodes_per_update(self) -> int:
         """Episodes that a seed plays for an update."""
         return find_algorithm(self.algorithm).search_episodes or self.num_episodes
@@ -86,6 +91,23 @@ class Config(
         if self.whole_after < 1 or not self.train_horizon:
             return limit
         return min(limit, self.train_horizon)
+
+    def env_steps_at(self, num_updates: int) -> int | None:
+        """Returns the budget in env steps after so many updates.
+
+        That is ``env_steps``, unless ``budgets`` says how it came about.
+        """
+        if self.budgets[-1:] != (self.env_steps,):  # another budget was given since
+            return self.env_steps
+        pairs = zip(self.budgets[::2], self.budgets[1::2], strict=True)
+        past_budgets = [env_steps for update, env_steps in pairs if update <= num_updates]
+        return (past_budgets or [self.env_steps])[-1]
+
+    def with_budget(self, num_updates: int, env_steps: int) -> "Config":
+        """Returns the settings with another budget in env steps from an update on."""
+        past_budgets = self.budgets if self.budgets[-1:] == (self.env_steps,) else ()
+        budgets = (*past_budgets, num_updates, env_steps)
+        return dataclasses.replace(self, minutes=None, env_steps=env_steps, budgets=budgets)
 
     @property
     def block_length(self) -> int:
@@ -142,6 +164,11 @@ def check_each(config: Config) -> None:
             f"--seeds {config.seeds} names {len(read_seeds(config.seeds))} seeds, and num_seeds is "
             f"{config.num_seeds}: make them agree"
         )
+    if len(config.budgets) % 2 or not all(0 <= x <= MAX_COUNT for x in config.budgets):
+        raise ValueError(
+            "--budgets must be pairs of an update and env steps, from 0 to 2^53, got "
+            f"{config.budgets}"
+        )
     # Before hours of training, and not where the first row is logged.
     for name in config.log:
         _check_installed(name)
@@ -165,6 +192,12 @@ def check_each(config: Config) -> None:
             # None and words, such as "budget", are no numbers, and ``check_type`` let them pass.
             if not (value is None or isinstance(value, str) or rule.holds(value)):
                 raise ValueError(f"{flag(name)} must be {rule.words}, got {reprlib.repr(value)}")
+    last_seed = config.first_seed + config.num_seeds - 1
+    if (last_seed + 1) * config.race > MAX_OF_UPDATE:
+        raise ValueError(
+            f"--race {config.race} has no random numbers for seed {last_seed:,}: a race of seed n "
+            f"takes those of the seeds from {config.race} n on; lower one of them"
+        )
 
 
 #: The package that each log needs.

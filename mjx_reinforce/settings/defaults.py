@@ -67,7 +67,7 @@ OF_BUDGETS: dict[str, list[tuple[int, dict[str, Any]]]] = {}
 for _row in _ROWS:
     if "at_least" in _row:
         OF_BUDGETS.setdefault(_row["task"], []).append((_row["at_least"], _without_facts(_row)))
-#: Environment id -> the env steps of a seed that a default run trains, on a CPU and on a GPU.
+#: Environment id -> about how many env steps of a seed a minute trains, on a CPU and on a GPU.
 MINUTES: dict[str, tuple[int, int]] = {
     task: row["minute"] for task, row in _SMALLEST.items() if "minute" in row
 }
@@ -193,8 +193,18 @@ def flag_value(arguments: Sequence[str], flag: str) -> str | None:
     return flag_text
 
 
-def for_arguments(arguments: Sequence[str]) -> Config:
-    """Returns the default settings for what a command line names: the task, seeds and budget."""
+#: The flags of which any says when a run ends.
+_BUDGET_FLAGS = ("--env-steps", "--minutes", "--max-updates")
+
+
+def for_arguments(arguments: Sequence[str], *, timed: bool = False) -> Config:
+    """Returns the default settings for what a command line names: the task, seeds and budget.
+
+    Args:
+      arguments: of the command line.
+      timed: whether a task of which ``MINUTES`` knows is trained for a minute, if nothing else
+        is said; else for as many env steps as that is about.
+    """
 
     def positive_number(flag: str, read: Callable[[str], Any]) -> Any:
         """Returns a positive number, or None, also for what the parser refuses."""
@@ -204,9 +214,12 @@ def for_arguments(arguments: Sequence[str]) -> Config:
             return None
         return number if 0 < number < float("inf") else None
 
-    return of_task(
+    config = of_task(
         flag_value(arguments, "--env") or Config.env,
         env_steps=positive_number("--env-steps", whole_number),
         num_seeds=positive_number("--num-seeds", whole_number) or Config.num_seeds,
         minutes=positive_number("--minutes", float),
     )
+    if timed and config.env in MINUTES and not any(flag_value(arguments, x) for x in _BUDGET_FLAGS):
+        return dataclasses.replace(config, minutes=1.0)
+    return config

@@ -91,6 +91,11 @@ class RunSettings:
     )
     """FIRST:END, in place of --num-seeds: seeds FIRST to END - 1, a share of a larger run, for one
     of several machines. `python -m mjx_reinforce.report A B` joins shares."""
+    race: int = setting(1, *COUNT, once="it is for one run")
+    """Policies that train for each seed and race: at a quarter, a half and three quarters of the
+    budget, the half with the better training returns replaces the other half, and goes on with
+    random numbers of its own; the best one at the end is the seed's. Each has --env-steps, so that
+    a seed costs as many times as much. A mean over such seeds is one of races: say so beside it."""
     seed: int = setting(
         0,
         Range.SEED,
@@ -99,14 +104,19 @@ class RunSettings:
     )
     """Root of all randomness; the seeds' keys are split from it."""
     env_steps: int | None = setting(280_000, *TOTAL, Mark.BUDGET, Mark.NOT_COMPILED)
-    """Training budget per seed, in env steps; a seed stops after the update that reaches it. By
-    default, about a minute of training on this machine. None: only --max-updates counts."""
+    """Training budget per seed, in env steps; a seed stops after the update that reaches it. None:
+    only --max-updates counts."""
     minutes: float | None = setting(
         None, Range.POSITIVE, Mark.BUDGET, Mark.NOT_COMPILED, once="it is for one run"
     )
     """Training time of all seeds together, in place of --env-steps. The first updates measure how
-    many env steps fit. config.json keeps that number, so --like RUN repeats the run to the bit. If
-    episodes get longer, the run ends early."""
+    many env steps fit, and what follows corrects that. config.json keeps these numbers, so --like
+    RUN repeats the run to the bit. The default of most tasks, if no other budget is given."""
+    budgets: tuple[int, ...] = setting(
+        (), Mark.BUDGET, Mark.NOT_COMPILED, once="it is measured in one run"
+    )
+    """What --minutes measured, for config.json: a number of updates and the --env-steps from there
+    on, and so on. Ignored if the last of them is not --env-steps."""
     max_updates: int | None = setting(None, *TOTAL, Mark.BUDGET, Mark.NOT_COMPILED)
     """Stop every seed after this many updates. With --num-episodes 1, these are episodes."""
     num_episodes: int = _for_gradients(16, *COUNT)

@@ -151,7 +151,7 @@ def _for_many_seeds(
         cut_steps = config.train_horizon
         learner = schedules.Cut(cut_steps, config.whole_after)(learner)
     learner = wrappers.in_one_launch(learner, devices)
-    return wrappers.short_episodes(learner, horizon, config.num_seeds, cut_steps)
+    return wrappers.short_episodes(learner, horizon, config.num_policies, cut_steps)
 
 
 def _call_choice(

@@ -136,7 +136,7 @@ def build_ready(
     # Programs of a sweep are traced for one run: as many as fit are put side by side later.
     width = 1
     if traced is None:
-        width = division.width(config.num_seeds)
+        width = division.width(config.num_policies)
     built = build(env, config, devices=devices, num_seeds=width)
     learner = built.learner
     threshold = getattr(env, "reward_threshold", None)

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
 
+import jax
 import numpy as np
 
 from mjx_reinforce.files import Arrays
@@ -12,10 +13,20 @@ from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import MAX_COUNT, Config
+from mjx_reinforce.training import race
+from mjx_reinforce.training.minutes import Deadline, env_steps_in
 from mjx_reinforce.training.record import HOPELESS, Measured, Record, RunRecord
 from mjx_reinforce.training.resume import Checkpoint, check_arrays, decisive
 from mjx_reinforce.training.slots import Slots, Stopwatch
-from mjx_reinforce.training.state import Best, Budget, StateRows, begin_with, first_best, keep_best
+from mjx_reinforce.training.state import (
+    Best,
+    Budget,
+    StateRows,
+    begin_with,
+    copied,
+    first_best,
+    keep_best,
+)
 
 
 class Evaluation(NamedTuple):
@@ -185,12 +196,14 @@ class Driver:
         num_blocks = 1
         max_blocks = self._max_blocks()
         while not (self.ended or interrupted()):
+            self._renew()
             evaluate = not self.record.is_evaluated()
             if self.record.over():
                 # No updates follow with which the last policies could be evaluated.
                 if evaluate:
                     self._take([self.slots.evaluate()])
                 break
+            self._cut()
             start = time.perf_counter()
             active, lengths = self.record.moved()
             blocks = self.slots.advance(active, lengths, evaluate=evaluate, max_blocks=num_blocks)
@@ -199,6 +212,12 @@ class Driver:
             timely_blocks = len(blocks) * _CALL_SECONDS / (time.perf_counter() - start)
             num_blocks = max(1, min(int(timely_blocks), 2 * len(blocks), max_blocks))
             self._take(blocks)
+
+    def _renew(self) -> None:
+        """Sets the budget of what follows; that of a sweep is one for all its time."""
+
+    def _cut(self) -> None:
+        """Drops policies of races where that is due; those of a sweep do not race."""
 
     def _max_blocks(self) -> int:
         """Returns how many blocks of updates are made before the host sees any of them."""
@@ -228,11 +247,13 @@ class RunDriver(Driver):
     """Trains the seeds of a run by itself, which has evaluations to show and best policies.
 
     config: the settings of the run, its horizon among them
-    states: of training, on the host
-    best: the best policies so far
+    states: of training, on the host, of the R policies, see ``RunRecord``
+    best: the best of each of these so far
+    deadline: when it is to end, if its budget is in time
     """
 
     record: RunRecord
+    deadline: Deadline | None = None
 
     def __init__(
         self,
@@ -271,6 +292,39 @@ class RunDriver(Driver):
         if self.ended and not self.record.is_evaluated():
             self._take([self.slots.evaluate()])
 
+    def _renew(self) -> None:
+        """Sets the budget of what follows: found anew if it is in time, or as it was recorded."""
+        record = self.record
+        num_updates = self.updates()
+        env_steps = self.config.env_steps_at(num_updates)
+        if self.deadline is not None and env_steps is not None:
+            mean_steps = float(record.env_steps.mean())
+            new_budget = self.deadline.budget(self.seconds(), mean_steps, env_steps)
+            if new_budget is not None:
+                self.config = self.config.with_budget(num_updates, new_budget)
+                env_steps = new_budget
+        record.config = dataclasses.replace(self.config, env_steps=env_steps)
+        self.slots.budget = Budget.of(env_steps, self.config.max_updates)
+
+    def _cut(self) -> None:
+        # Before a block, and so decided by what a checkpoint holds: a run that goes on cuts too.
+        policy_sources = self.record.cut()
+        if policy_sources is not None:
+            self.slots.restore(copied(self.states, policy_sources))
+            self.states = self.slots.states()
+
+    def last_actors(self) -> Actor:
+        """Returns the newest policy of each seed [S, ...]."""
+        return _entries(self.states.train_states.actor, self.record.leaders())
+
+    def best_actors(self) -> Actor:
+        """Returns the policies of the seeds [S, ...] with the best evaluations."""
+        return _entries(self.best.actor, self._best_rows())
+
+    def _best_rows(self) -> np.ndarray:
+        """Returns the number of the policy with the best evaluation of each seed [S]."""
+        return race.leaders(self.best.eval_return, self.config.race)
+
     def _max_blocks(self) -> int:
         """Returns 1: ``_take`` has the states before one block and after it, none between."""
         return 1
@@ -291,13 +345,14 @@ class RunDriver(Driver):
         )
         self.best = keep_best(self.best, present_best)
         rows = self.record.add_evaluation(measured, self._reached)
+        leaders = self.record.leaders()
         evaluation = Evaluation(
-            updates=counts.to_int(num_updates),
-            env_steps=self.record.env_steps.copy(),
+            updates=counts.to_int(num_updates[leaders]),
+            env_steps=self.record.played_steps(),
             seconds=self._reached,
-            measured=eval_metrics,
-            actor=actor,
-            train_states=self.states.train_states,
+            measured=_entries(eval_metrics, leaders),
+            actor=_entries(actor, leaders),
+            train_states=_entries(self.states.train_states, leaders),
         )
         for observer in self.observers:
             observer.evaluated(self, evaluation, rows)
@@ -314,13 +369,17 @@ class RunDriver(Driver):
           The returns of both, or nothing if it was interrupted.
         """
         returns = {}
-        for name, actor in (("final", self.states.train_states.actor), ("best", self.best.actor)):
+        tested_policies = (
+            ("final", self.states.train_states.actor, self.record.leaders()),
+            ("best", self.best.actor, self._best_rows()),
+        )
+        for name, actor, rows in tested_policies:
             # Half a test is none: summary.json has both returns or neither.
             if interrupted():
                 return {}
             eval_metrics = self.slots.test(actor)
             self.record.count_steps(eval_metrics)
-            returns[f"{name}_test_returns"] = eval_metrics["eval_return"].tolist()
+            returns[f"{name}_test_returns"] = eval_metrics["eval_return"][rows].tolist()
         return returns
 
     def summary(self, engine: str, compile_seconds: float, test: dict[str, Any]) -> dict[str, Any]:
@@ -339,9 +398,14 @@ class RunDriver(Driver):
         return {
             **status,
             **self.record.summary(engine, compile_seconds, self.seconds()),
-            "best_updates": counts.to_int(self.best.num_updates).tolist(),
+            "best_updates": counts.to_int(self.best.num_updates[self._best_rows()]).tolist(),
             **test,
         }
+
+
+def _entries(leaves: Any, places: np.ndarray) -> Any:
+    """Returns a pytree of some entries [S, ...] of leaves [R, ...]."""
+    return jax.tree.map(lambda leaf: leaf[places], leaves)
 
 
 def sweep_summary(
@@ -392,87 +456,26 @@ def begin_run(
         check_layout(checkpoint, slots)  # before a file is touched
     if actors is not None:
         slots.restore(begin_with(slots.states(), actors))
+    deadline = None
     if config.minutes is not None:
         # From here on the budget is in env steps, so that a run that is resumed, or repeated with
         # its config.json, ends where this one does. The speed is that of the states from which it
         # goes on; what is trained to measure it is undone.
+        start_time = time.perf_counter()
         first_rows = slots.rows()
+        past = 0.0, 0.0, 0
         if checkpoint is not None:
             slots.restore(checkpoint.states)
+            record = checkpoint.record
+            past = checkpoint.seconds, record["env_steps"].mean(), int(record["updates"].max())
+        seconds, past_steps, num_updates = past
         env_steps = env_steps_in(60 * config.minutes, slots, config, interrupted)
         slots.restore(first_rows)
-        say(f"{config.minutes:g} min are about {env_steps:,} env steps per seed here")
-        config = dataclasses.replace(config, env_steps=env_steps, minutes=None)
-    slots.budget = Budget.of(config.env_steps, config.max_updates)
-    return RunDriver(config, slots, RunRecord(config, threshold), runs, observers)
-
-
-#: The share of the time in which its speed is measured; what is trained in it is trained again.
-_TRIAL_SHARE = 0.03
-
-
-class _Moment(NamedTuple):
-    """How far a trial is.
-
-    seconds: since its start
-    env_steps: of the mean seed, those before the trial too
-    updates: of the seed with the most, those before the trial too
-    """
-
-    seconds: float
-    env_steps: float
-    updates: int
-
-    @classmethod
-    def of(cls, seconds: float, slots: Slots) -> "_Moment":
-        """Returns how far the seeds are at this time."""
-        states = slots.states().train_states
-        env_steps = float(counts.to_int(states.env_steps).mean())
-        return cls(seconds, env_steps, int(counts.to_int(states.num_updates).max()))
-
-
-def env_steps_in(
-    seconds: float, slots: Slots, config: Config, interrupted: Callable[[], bool] = lambda: False
-) -> int:
-    """Returns the env steps that a mean seed will have played in all after a time.
-
-    The seeds are trained, and evaluated, for a small share of that time. The speed of the second
-    half of this trial counts: the first updates also have what a device does once, and the shortest
-    episodes.
-
-    Args:
-      seconds: the time.
-      slots: the seeds, where the run goes on.
-      config: the settings.
-      interrupted: whether the first update of the trial is to be the last.
-    """
-    max_updates = MAX_COUNT if config.max_updates is None else config.max_updates
-    start_time = time.perf_counter()
-    moments = [_Moment.of(0.0, slots)]
-    # Calls of 1, 2, 4, ... updates: nobody knows yet how long one takes, and so the last call is
-    # about half of the trial. The first call does not count as a trial: on a GPU it loads programs.
-    trial = 0.0
-    while trial < _TRIAL_SHARE * seconds and not (moments[1:] and interrupted()):
-        num_updates = 2 ** (len(moments) - 1)
-        slots.budget = Budget.of(None, min(moments[-1].updates + num_updates, max_updates))
-        if not slots.advance(evaluate=False):
-            break  # no seed has an update left
-        moments.append(_Moment.of(time.perf_counter() - start_time, slots))
-        trial = moments[-1].seconds - moments[1].seconds
-    start = moments[0]
-    end = moments[-1]
-    if len(moments) == 1:
-        return max(1, round(start.env_steps))
-    # The last call alone, if no moment before it is in the second half.
-    middle = next((x for x in moments[1:-1] if x.seconds >= end.seconds / 2), moments[-2])
-    elapsed = end.seconds - middle.seconds
-    # The trial was not evaluated. The run is, after every block, and stands still meanwhile unless
-    # evaluations share the launches of updates.
-    block_seconds = config.block_length * elapsed / (end.updates - middle.updates)
-    slots.seconds_to_evaluate()  # the first has what a device does once
-    eval_seconds = slots.seconds_to_evaluate()
-    env_steps_per_second = (end.env_steps - middle.env_steps) / elapsed
-    env_steps_per_second = env_steps_per_second * block_seconds / (block_seconds + eval_seconds)
-    # The trial took its time, and what it trained is undone: the run goes on from its start.
-    remaining_seconds = max(seconds - (time.perf_counter() - start_time), 0.0)
-    return min(max(1, round(start.env_steps + env_steps_per_second * remaining_seconds)), MAX_COUNT)
+        say(f"{config.minutes:g} min are at first about {env_steps:,} env steps per seed here")
+        end = seconds + 60 * config.minutes - (time.perf_counter() - start_time)
+        deadline = Deadline(seconds, end, past_steps)
+        config = config.with_budget(num_updates, env_steps)
+    slots.budget = Budget.of(config.env_steps_at(0), config.max_updates)
+    driver = RunDriver(config, slots, RunRecord(config, threshold), runs, observers)
+    driver.deadline = deadline
+    return driver

@@ -14,6 +14,7 @@ import numpy as np
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import iqm, summarize
+from mjx_reinforce.training import race
 
 
 class Measured(NamedTuple):
@@ -220,8 +221,8 @@ class Record:
     _saved: tuple[str, ...] = ("updates", "env_steps", "nonfinite", "returns", "seen", "lengths")
 
     def __init__(self, config: Config):
-        """Begins before the first update; R is ``config.num_seeds``."""
-        num_runs = config.num_seeds
+        """Begins before the first update; R is ``config.num_policies``."""
+        num_runs = config.num_policies
         self.config = config
         self.returns = np.zeros(num_runs, np.float32)
         self.updates = np.zeros(num_runs, np.int64)
@@ -328,6 +329,10 @@ class Record:
         self.nonfinite[runs] += num_nonfinite
         return num_nonfinite
 
+    def played_steps(self) -> np.ndarray:
+        """Returns the env steps that were played in training for each run."""
+        return self.env_steps
+
     def moved(self) -> tuple[np.ndarray | None, np.ndarray | None]:
         """Returns which runs [R] have not used their budget, and how long their episodes are."""
         return self.used() < 1.0, self.lengths
@@ -343,16 +348,17 @@ class Record:
           gained_fraction: how much of the fraction was new, for an estimate of the time left.
           seconds_passed: seconds in which that came.
         """
+        env_steps = self.played_steps()
         env_steps_per_second = math.nan
         if seconds > 0:
-            env_steps_per_second = float(self.env_steps.sum() / seconds)
+            env_steps_per_second = float(env_steps.sum() / seconds)
         seconds_left = math.nan
         if gained_fraction > 0:
             seconds_left = (1 - fraction) * seconds_passed / gained_fraction
         return Progress(
             fraction=fraction,
             updates=int(self.updates.max()),
-            env_steps=float(self.env_steps.mean()),
+            env_steps=float(env_steps.mean()),
             iqm=float(iqm(self.returns)),
             worst=float(self.returns.min()),
             failed=int(np.sum(~np.isfinite(self.returns))),
@@ -373,13 +379,31 @@ class Record:
 class RunRecord(Record):
     """Everything that the S seeds of a run have measured so far.
 
-    episodes: [S] int64, how many each seed has played in training
+    In races, R policies are trained and S of them lead; without, each seed has one, which leads.
+    What belongs to a policy is that of its line: a copy has what its source has.
+
+    episodes: [R] int64, how many each policy has learned from
+    dropped_steps, dropped_episodes: [R] int64, what those had learned from that were dropped here,
+      less what their sources had
+    cuts: [S] int64, how many cuts each race has had
+    returns: [S] of each leader's latest evaluation
     simulated, evaluated: steps that were simulated, and those of evaluations
-    broken_in_a_row: [S] see ``broken_in_a_row``
+    broken_in_a_row: [R] see ``broken_in_a_row``
     threshold: the return that counts as solved, if any
     """
 
-    _saved = (*Record._saved, "episodes", "broken_in_a_row", "simulated", "evaluated")
+    #: What a policy takes from its source, besides the tables.
+    _of_lines = ("updates", "env_steps", "episodes", "seen", "broken_in_a_row")
+    _saved = (
+        *Record._saved,
+        "episodes",
+        "dropped_steps",
+        "dropped_episodes",
+        "cuts",
+        "broken_in_a_row",
+        "simulated",
+        "evaluated",
+    )
 
     def __init__(self, config: Config, threshold: float | None):
         """Begins before the first update.
@@ -389,22 +413,67 @@ class RunRecord(Record):
           threshold: the return that counts as solved, if any.
         """
         super().__init__(config)
-        num_seeds = config.num_seeds
+        num_policies = config.num_policies
         self.threshold = threshold
-        self.episodes = np.zeros(num_seeds, np.int64)
-        self.broken_in_a_row = np.zeros(num_seeds, np.int64)
+        self.returns = np.zeros(config.num_seeds, np.float32)
+        self.episodes = np.zeros(num_policies, np.int64)
+        self.dropped_steps = np.zeros(num_policies, np.int64)
+        self.dropped_episodes = np.zeros(num_policies, np.int64)
+        self.cuts = np.zeros(config.num_seeds, np.int64)
+        self.broken_in_a_row = np.zeros(num_policies, np.int64)
         # Python's ints, which do not overflow: both are sums over all seeds and all updates.
         self.simulated = 0
         self.evaluated = 0
         # A run that ends before its first update has these columns without rows.
         dtypes = {"episode_return": np.float32, "env_steps": np.int64, "episodes": np.int64}
-        no_rows = {name: np.zeros((0, num_seeds), dtype) for name, dtype in dtypes.items()}
+        no_rows = {name: np.zeros((0, num_policies), dtype) for name, dtype in dtypes.items()}
         #: "last" has one row, the metrics of each seed's last update.
         self._tables |= {"training": [no_rows], "last": []}
 
     def moved(self) -> tuple[None, None]:
         """Returns None for all: a seed whose budget is used is still evaluated."""
         return None, None
+
+    def played_steps(self) -> np.ndarray:
+        """Returns the env steps [S] that all policies of a seed have played in training."""
+        return self._of_seeds(self.env_steps + self.dropped_steps)
+
+    def _of_seeds(self, policy_counts: np.ndarray) -> np.ndarray:
+        """Returns counts of policies [..., R] summed over each seed's [..., S]."""
+        seed_shape = (*policy_counts.shape[:-1], self.config.num_seeds, self.config.race)
+        return policy_counts.reshape(seed_shape).sum(axis=-1)
+
+    def scores(self) -> np.ndarray:
+        """Returns by what policies are judged [R], see ``race.scores``."""
+        return race.scores(self._columns("training")["episode_return"], self.updates)
+
+    def leaders(self) -> np.ndarray:
+        """Returns the number of each seed's policy [S]: of those that race the one that leads."""
+        if self.config.race == 1:
+            return np.arange(self.config.num_seeds)
+        return race.leaders(self.scores(), self.config.race)
+
+    def cut(self) -> np.ndarray | None:
+        """Drops policies if that is due: in a race whose first one has used a share of its budget.
+
+        Returns:
+          The sources [R], see ``race.sources``; None if no cut is due.
+        """
+        used_most = self.used().reshape(-1, self.config.race).max(axis=1)
+        passed_shares = np.searchsorted(race.SHARES, used_most, side="right")
+        is_cut = passed_shares > self.cuts
+        if self.config.race == 1 or not is_cut.any():
+            return None
+        policy_sources = race.sources(self.scores(), is_cut)
+        self.cuts = np.maximum(self.cuts, passed_shares)
+        self.dropped_steps += self.env_steps - self.env_steps[policy_sources]
+        self.dropped_episodes += self.episodes - self.episodes[policy_sources]
+        for name in self._of_lines:
+            setattr(self, name, getattr(self, name)[policy_sources])
+        for table in ("training", "last"):
+            columns = self._columns(table)
+            self._tables[table] = [{name: x[:, policy_sources] for name, x in columns.items()}]
+        return policy_sources
 
     def add_updates(self, measured: Measured) -> np.ndarray:
         """Takes in a block of updates.
@@ -415,7 +484,7 @@ class RunRecord(Record):
           measured: the metrics are those of ``Learner.step`` and of ``block_of_updates``.
 
         Returns:
-          What ``nonfinite_updates`` does.
+          What ``nonfinite_updates`` does, of each seed.
         """
         metrics = measured.metrics
         active = metrics["active"]
@@ -434,7 +503,7 @@ class RunRecord(Record):
         self.simulated += _sum(metrics["simulated_steps"])
         self.broken_in_a_row = broken_in_a_row(self.broken_in_a_row, metrics)
         self._remember(metrics | {"episode_return": returns})
-        return super().add_updates(measured)
+        return self._of_seeds(super().add_updates(measured))
 
     def _remember(self, metrics: Arrays) -> None:
         """Keeps each seed's metrics of its last update; a seed that stands still makes none."""
@@ -452,26 +521,39 @@ class RunRecord(Record):
         ]
 
     def add_evaluation(self, measured: Measured, seconds: float) -> Arrays:
-        """Takes in an evaluation [S] of the present policies of all seeds.
+        """Takes in an evaluation [R] of the present policies.
 
         Args:
           measured: in it.
           seconds: wall time since compilation ended.
 
         Returns:
-          Its rows in metrics.csv.
+          The rows of the leaders in metrics.csv.
         """
         eval_metrics = measured.eval_metrics
-        counts = {"env_steps": self.env_steps, "episodes": self.episodes}
-        self._append(**eval_metrics, **counts, updates=self.updates, seconds=np.array(seconds))
+        leaders = self.leaders()
+        self._append(
+            **eval_metrics,
+            env_steps=self.env_steps,
+            played_steps=self.env_steps + self.dropped_steps,
+            episodes=self.episodes + self.dropped_episodes,
+            updates=self.updates,
+            leads=np.isin(np.arange(self.config.num_policies), leaders),
+            seconds=np.array(seconds),
+        )
         self.count_steps(eval_metrics)
-        self.returns = eval_metrics["eval_return"]
+        self.returns = eval_metrics["eval_return"][leaders]
         self.seen = self.env_steps.copy()
-        # Columns of metrics.csv are singular: a row is of one update of one seed.
-        seeds = self.config.first_seed + np.arange(len(self.updates))
-        counts |= {"seed": seeds, "update": self.updates}
         last_metrics = {name: x[0] for name, x in self._columns("last").items()}
-        return as_rows(last_metrics | eval_metrics | counts, seconds)
+        policy_metrics = last_metrics | eval_metrics | {"update": self.updates}
+        leader_metrics = {name: x[leaders] for name, x in policy_metrics.items()}
+        # Columns of metrics.csv are singular: a row is of one update of one seed.
+        counts = {
+            "seed": self.config.first_seed + np.arange(self.config.num_seeds),
+            "env_steps": self.played_steps(),
+            "episodes": self._of_seeds(self.episodes + self.dropped_episodes),
+        }
+        return as_rows(leader_metrics | counts, seconds)
 
     def progress(self) -> Progress:
         """Returns how far the run is, right after an evaluation."""
@@ -510,9 +592,25 @@ class RunRecord(Record):
     def training(self) -> Arrays:
         """Returns ``episode_return`` and the ``env_steps`` and ``episodes`` after it, [U, S].
 
-        A return is NaN where the seed stood still or an episode left the finite numbers.
+        A return is NaN where the seed stood still or an episode left the finite numbers. Of a race
+        this is the line of its leader alone.
         """
-        return self._columns("training")
+        return {name: x[:, self.leaders()] for name, x in self._columns("training").items()}
+
+    def history(self) -> Arrays:
+        """Returns what the evaluations of the leaders measured, [E, S] each, see ``Record``.
+
+        The env steps and the episodes are of all policies of a seed together.
+        """
+        table = self._columns("evaluations")
+        if not table:
+            return {}
+        policy_returns = table["eval_return"]
+        return {
+            "eval_return": policy_returns[table["leads"]].reshape(-1, self.config.num_seeds),
+            "env_steps": self._of_seeds(table["played_steps"]),
+            "episodes": self._of_seeds(table["episodes"]),
+        }
 
     def summary(self, engine: str, compile_seconds: float, run_seconds: float) -> dict[str, Any]:
         """Returns what summary.json says.
@@ -522,19 +620,20 @@ class RunRecord(Record):
           compile_seconds: wall time of compiling.
           run_seconds: wall time since then.
         """
-        env_steps = self.env_steps.sum()
+        env_steps = self.played_steps().sum()
         return {
             "env": self.config.env,
             "engine": engine,
             "num_seeds": self.config.num_seeds,
+            "race": self.config.race,
             "threshold": self.threshold,
             **summarize(self.history(), self.threshold),
-            "env_steps": self.env_steps.tolist(),
+            "env_steps": self.played_steps().tolist(),
             "compile_seconds": compile_seconds,
             "run_seconds": run_seconds,
             "env_steps_per_second": float(env_steps / run_seconds),
             "useful_step_fraction": float((env_steps + self.evaluated) / max(self.simulated, 1)),
-            "nonfinite": self.nonfinite.tolist(),
+            "nonfinite": self._of_seeds(self.nonfinite).tolist(),
         }
 
 

@@ -430,7 +430,11 @@ def _serves(checkpoint: Checkpoint, config: Config) -> bool:
     Raises:
       ValueError: the budget is smaller than what it has used.
     """
-    if (checkpoint.env_steps, checkpoint.max_updates) == (config.env_steps, config.max_updates):
+    # A run in time has had several budgets, one after the other.
+    if checkpoint.max_updates == config.max_updates and checkpoint.env_steps in (
+        config.env_steps,
+        *config.budgets[1::2],
+    ):
         return True
     for name, budget, minimum in (
         ("env_steps", config.env_steps, checkpoint.record["env_steps"].max()),

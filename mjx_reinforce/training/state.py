@@ -130,6 +130,13 @@ def _flat(leaf: PyTree) -> Any:
     return leaf.reshape(len(leaf), int(np.prod(leaf.shape[1:])))
 
 
+def copied(state: RunState, sources: np.ndarray) -> RunState:
+    """Returns states [R] of which each is that of its source [R], but for its own random keys."""
+    new_state = jax.tree.map(lambda leaf: leaf[sources], state)
+    train_states = dataclasses.replace(new_state.train_states, key=state.train_states.key)
+    return dataclasses.replace(new_state, train_states=train_states, eval_keys=state.eval_keys)
+
+
 class Best(struct.PyTreeNode, kw_only=True):
     """The best policies so far.
 
@@ -237,6 +244,7 @@ def last_actors(config: Config, policy: Mapping[str, Any]) -> Actor:
             )
     # A run with more seeds than that one begins with some of its policies several times.
     seeds = (config.first_seed + np.arange(config.num_seeds)) % saved_policy.num_seeds
+    seeds = np.repeat(seeds, config.race)
     return jax.tree.map(lambda x: x[seeds], saved_policy.actor)
 
 

@@ -451,7 +451,7 @@ def named(*kinds):
 _OTHER_COUNTS = {"seed", "num_seeds", "normalize_steps"}
 _COUNTS = sorted({*named(int, int | None)} - _OTHER_COUNTS)
 _NUMBERS = named(float, float | None)
-_SIZES = named(tuple[int, ...])
+_SIZES = [name for name in named(tuple[int, ...]) if name != "budgets"]
 
 
 def test_every_setting_has_its_bounds_and_type():
@@ -462,6 +462,7 @@ def test_every_setting_has_its_bounds_and_type():
         (_NUMBERS, (math.nan, math.inf, -math.inf, -1e13, "1", True)),
         (("discount", "momentum", "whole_after"), (-1e-9, 1.001)),
         (_SIZES, ((0,), (2**31,), (1.5,), 32, "32")),
+        (("budgets",), ((0,), (-1, 9), (0, 2**53 + 1), (0, 1.5), 32)),
         (("policy", "estimator", "engine", "env", *_CHOICES), ("", None, 1)),
     ]
     cases = [(name, value) for names, values in wrong for name in names for value in values]

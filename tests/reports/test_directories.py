@@ -25,7 +25,8 @@ def test_a_run_that_goes_on(run):
     source = read_directory(run)
     [part] = source.configurations
     assert (source.env, source.status, source.threshold) == ("Hopper-v5", "running", None)
-    assert source.settings == {"env": "Hopper-v5", "learning_rate": 0.01, "engine": "auto"}
+    named = {"env": "Hopper-v5", "learning_rate": 0.01, "engine": "auto"}
+    assert source.settings == named | {"race": 1}
     assert source.provenance == {"device": "cpu", "engine": "auto"}
     np.testing.assert_array_equal(part.eval_return, [[1.5, -0.5], [np.nan, 3.0]])
     assert part.env_steps.tolist() == [[10, 12], [20, 22]]

@@ -20,11 +20,11 @@ class Run:
     def __init__(self):
         self.config = Config(num_seeds=2, checkpoint_every=4)
         self.made, self.finished, self.ended = 0, False, False
-        self.states = SimpleNamespace(train_states=SimpleNamespace(actor="last"))
-        self.best = SimpleNamespace(actor="best")
+        self.last_actors = lambda: "last"
+        self.best_actors = lambda: "best"
         self.record = SimpleNamespace(
             finished=lambda: self.finished,
-            env_steps=np.zeros(2, int),
+            played_steps=lambda: np.zeros(2, int),
             training=dict,
             history=dict,
             threshold=None,

@@ -40,7 +40,7 @@ def evaluation(update, num_seeds=20, first=False):
 
 def begin(directory, config):
     """Begins a run in a directory, or goes on without a checkpoint."""
-    record = SimpleNamespace(env_steps=np.zeros(1))
+    record = SimpleNamespace(played_steps=lambda: np.zeros(1))
     run = SimpleNamespace(config=config, updates=lambda: 0, record=record)
     group_plan = SimpleNamespace(ready=SimpleNamespace(policy={}, engine="vmap", terms=()))
     plan = SimpleNamespace(saved_record={}, checkpoint=None, group_plans=[group_plan])

@@ -67,7 +67,8 @@ def test_minutes_become_env_steps_before_the_run_begins(ready, monkeypatch):
     timed = dataclasses.replace(CONFIG, minutes=0.5)
     driver = begin(ready, timed, say=said.append)
     assert (driver.config.env_steps, driver.config.minutes) == (30_000, None)
-    assert said == ["0.5 min are about 30,000 env steps per seed here"]
+    assert driver.config.budgets == (0, 30_000)
+    assert said == ["0.5 min are at first about 30,000 env steps per seed here"]
 
 
 def test_a_run_begins_with_the_policies_of_another(ready, driver):

@@ -3,10 +3,12 @@
 import dataclasses
 import itertools
 import json
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from saved_runs import assert_same
 
 from experiments.kit.trainings import results
 from mjx_reinforce import envs
@@ -15,7 +17,7 @@ from mjx_reinforce.runs.command_line import parse
 from mjx_reinforce.settings import defaults
 from mjx_reinforce.settings.config import MAX_COUNT, Config, check
 from mjx_reinforce.settings.defaults import of_task
-from mjx_reinforce.training import driver
+from mjx_reinforce.training import minutes
 from mjx_reinforce.training import record as measured
 
 SMALL = ["--env", "ContinuousCartPole-v0", "--num-seeds", "3", "--eval-episodes", "2"]
@@ -33,6 +35,7 @@ def test_minutes_become_env_steps_that_repeat_the_run_and_go_on(run, tmp_path, c
     found = settings(tmp_path / "first")
     assert found["minutes"] is None
     assert found["env_steps"] > 100
+    assert found["budgets"][-1] == found["env_steps"]
     assert run("--like", "first", "--output", "second") == 0
     one, other = results(tmp_path / "first"), results(tmp_path / "second")
     assert all(one[name] == other[name] for name in one)
@@ -59,6 +62,23 @@ def test_minutes_become_env_steps_that_repeat_the_run_and_go_on(run, tmp_path, c
 
 
 @pytest.mark.slow
+def test_a_run_in_time_goes_on_from_any_of_its_budgets(run, tmp_path):
+    """Its newest checkpoint may be of an earlier budget than config.json says."""
+    timed = ["--minutes", 0.05, "--checkpoint-every", 5, "--output", "whole"]
+    assert run(*SMALL, *timed) == 0
+    whole = tmp_path / "whole"
+    assert len(settings(whole)["budgets"]) > 4
+    parts = shutil.copytree(whole, tmp_path / "parts")
+    (parts / "summary.json").write_text('{"status": "running"}')
+    [_, *newer] = sorted((parts / "checkpoint").iterdir())
+    for path in newer:
+        path.unlink()
+    assert run("--resume", "parts") == 0
+    assert settings(parts)["resumed"][0]["updates"] > 0
+    assert_same(whole, parts)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("gpu", [False, True])
 def test_a_default_run_has_the_budget_of_its_machine(monkeypatch, gpu):
     monkeypatch.setattr(defaults, "has_gpu", lambda: gpu)
@@ -68,7 +88,11 @@ def test_a_default_run_has_the_budget_of_its_machine(monkeypatch, gpu):
         assert config.env_steps == defaults.MINUTES.get(env, (Config.env_steps,) * 2)[gpu]
         # More seeds than a default run has leave each with what it would learn.
         assert of_task(env, num_seeds=1000) == dataclasses.replace(config, num_seeds=1000)
-        assert parse(["--env", env]).base == config
+        timed = dataclasses.replace(config, minutes=1.0 if env in defaults.MINUTES else None)
+        assert parse(["--env", env]).base == timed
+        assert parse(["--env", env, "--max-updates", "9"]).base.minutes is None
+        swept = ["--over", "discount", "0.9", "0.99"]
+        assert parse(["--env", env, *swept], name="sweep").base == config
         if gpu and env in defaults.OF_BUDGETS:
             assert config.num_episodes >= 128
         longer = of_task(env, minutes=2.0)
@@ -165,8 +189,44 @@ class Machine:
     ],
 )
 def test_what_is_trained_in_a_time(monkeypatch, seconds, machine, config, expected):
-    monkeypatch.setattr(driver.time, "perf_counter", lambda: machine.now)
-    assert driver.env_steps_in(seconds, machine, config) == expected
+    monkeypatch.setattr(minutes.time, "perf_counter", lambda: machine.now)
+    assert minutes.env_steps_in(seconds, machine, config) == expected
+
+
+@pytest.mark.parametrize(
+    ("speed_at", "first_budget"),
+    [
+        (lambda time: 1000, 60_000),
+        (lambda time: 1000 + 4000 * min(time / 40, 1), 60_000),  # episodes get longer
+        (lambda time: 3000 / (1 + time / 20), 180_000),  # or dearer
+        (lambda time: 1000, 2_000),
+        (lambda time: 1000, 10**7),
+        (lambda time: 1000 if int(time / 5) % 2 else 600, 10**7),
+    ],
+)
+def test_a_run_in_time_ends_in_time(speed_at, first_budget):
+    """Within six percent, though the first budget is wrong, by a few budgets after it."""
+    config = Config(minutes=1.0).with_budget(0, first_budget)
+    deadline = minutes.Deadline(start=10.0, end=70.0, env_steps=500.0)
+    time, env_steps, updates = 10.0, 500.0, 0
+    while env_steps < config.env_steps_at(updates):
+        time, env_steps, updates = time + 0.5, env_steps + 0.5 * speed_at(time), updates + 5
+        budget = deadline.budget(time, env_steps, config.env_steps_at(updates))
+        if budget is not None:
+            config = config.with_budget(updates, budget)
+    assert 66.4 < time < 73.6
+    assert 8 < len(config.budgets) < 26
+
+
+def test_budgets_hold_from_their_updates_on_unless_another_is_given():
+    config = Config(minutes=2.0).with_budget(0, 100).with_budget(20, 300)
+    assert (config.minutes, config.env_steps, config.budgets) == (None, 300, (0, 100, 20, 300))
+    assert [config.env_steps_at(x) for x in (0, 19, 20, 99)] == [100, 100, 300, 300]
+    later = dataclasses.replace(config, env_steps=500)
+    assert later.env_steps_at(0) == 500
+    assert later.with_budget(40, 700).budgets == (40, 700)
+    assert later.with_budget(40, 700).env_steps_at(0) == 700
+    assert Config(env_steps=None).env_steps_at(5) is None
 
 
 # How much of a budget is used, and when a checkpoint is due.

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from mjx_reinforce.learning import counts
+from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.driver import RunDriver, Runs
 from mjx_reinforce.training.record import Measured, RunRecord
@@ -24,7 +25,10 @@ class Steps:
     def states(self):
         made = np.stack([np.asarray(counts.from_int(self.number))] * 2)
         actor = {"w": np.full(2, self.number, np.float32)}
-        return SimpleNamespace(train_states=SimpleNamespace(actor=actor, num_updates=made))
+        train_states = TrainState(key=np.zeros(2), actor=actor, num_updates=made)
+        return SimpleNamespace(
+            train_states=train_states.replace(progress=np.zeros(2), env_steps=made)
+        )
 
     layout = SimpleNamespace(layout="a number")
 

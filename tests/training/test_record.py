@@ -238,6 +238,7 @@ def test_the_end_table_has_counts(monkeypatch):
     counts = np.full((1, 1000), 50_000)
     history = {"eval_return": returns, "env_steps": counts, "episodes": counts}
     more = {"status": "finished", "env": "Task-v0", "num_seeds": 1000, "env_steps_per_second": 1e6}
+    more |= {"race": 1, "env_steps": [50_000] * 1000}
     more |= {"useful_step_fraction": 0.9999, "compile_seconds": 1.0, "run_seconds": 2.0}
     more |= {
         "threshold": 950.0,
