@@ -70,6 +70,7 @@ _HEADERS = [
     "collision",
     "equality",
     "elimination",
+    "one_lane",
     "newton",
     "islands",
     "early_stop",

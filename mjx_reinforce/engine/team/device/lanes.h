@@ -29,6 +29,10 @@ using std::sqrt;
 #ifndef W
 #define W 1
 #endif
+#ifndef ONE_LANE
+#define ONE_LANE 0
+#endif
+constexpr bool ALONE = W == 1 && ONE_LANE;
 // The items of n that are this lane's.
 #define EACH(i, n) for (int i = lane; i < (n); i += W)
 
