@@ -126,7 +126,7 @@ def by_device_code(model: Any, settings: Settings, real: str, folder: Path) -> P
     source = folder / f"{real}.cpp"
     library = folder / f"{real}.so"
     program = Path(__file__).with_name("one_lane.h").read_text("utf-8")
-    source.write_text(f"#define REAL {real}\n#define REPORTS 0\n#define ONE_LANE 1\n{text}{program}", "utf-8")
+    source.write_text(f"#define REAL {real}\n#define REPORTS 0\n#define VECTORS 1\n{text}{program}", "utf-8")
     options = [*settings.options, "-std=c++17", "-w", "-shared", "-fPIC"]
     began = time.perf_counter()
     subprocess.run([str(COMPILER), *options, str(source), "-o", str(library)], check=True)

@@ -29,10 +29,11 @@ using std::sqrt;
 #ifndef W
 #define W 1
 #endif
-#ifndef ONE_LANE
-#define ONE_LANE 0
+// Whether a compiler is to make vectors of the loops of the only lane; see vectors.h.
+#ifndef VECTORS
+#define VECTORS 0
 #endif
-constexpr bool ALONE = W == 1 && ONE_LANE;
+static_assert(W == 1 || !VECTORS, "several lanes are no vectors");
 // The items of n that are this lane's.
 #define EACH(i, n) for (int i = lane; i < (n); i += W)
 
