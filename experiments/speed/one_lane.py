@@ -1,39 +1,40 @@
 """The device code of teams with one lane on a CPU beside C MuJoCo: physics steps per second.
 
-    python -m experiments.speed.one_lane /work/menagerie_models/mujoco_menagerie
+    python -m experiments.speed.one_lane mujoco_menagerie --episodes 64
 
 Each robot plays the same episodes from key frame 0 (or its initial state) under the same random
 controls: by C MuJoCo's ``rollout`` and by its ``Batch``, and by the device code that a C++ compiler
 has made machine code of, in float64 and in float32. All have the same number of threads, and take
-turns. What counts is the median of the ratios of one turn. The errors are those of qpos and qvel
-after a few physics steps, relative above 1.
+turns. Seconds are those of the CPU, of all threads together, as other programs may run meanwhile;
+what counts is the median over turns of a ratio within a turn. Behind it is the error: the largest
+of qpos and qvel after 20 physics steps, relative above 1, in the median episode.
 """
 
 import concurrent.futures
 import ctypes
 import dataclasses
-import functools
 import importlib
-import os
 import statistics
 import subprocess
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import tyro
 
 from experiments.kit.device_code import COMPILER
 from experiments.kit.markdown import table
+from mjx_reinforce.engine.memory import num_cores
 from mjx_reinforce.engine.team import tables
 
 mujoco: Any = importlib.import_module("mujoco")  # pyright does not know what is in it
 batch: Any = importlib.import_module("mujoco.batch")
 rollout: Any = importlib.import_module("mujoco.rollout")
 
+#: Scenes of Menagerie: a hand, two quadrupeds and a humanoid with hulls, cylinders or boxes.
 ROBOTS = (
     "shadow_hand/scene_left.xml",
     "unitree_go2/scene.xml",
@@ -41,6 +42,8 @@ ROBOTS = (
     "booster_t1/scene.xml",
 )
 _FEW_STEPS = 20
+#: Of the velocities at the start (m/s, rad/s).
+_SPREAD = 0.1
 
 #: (qpos [episodes, nq], qvel [episodes, nv], ctrl [episodes, env steps, nu]) -> those of the end.
 Player = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -92,7 +95,8 @@ def by_rollout(model: Any, settings: Settings) -> Player:
         start[:, 1 + model.nq : 1 + model.nq + model.nv] = qvel
         control = np.repeat(ctrl, settings.skip, axis=1)
         state, _ = pool.rollout(model, data, start, control)
-        return np.split(state[:, -1, 1 : 1 + model.nq + model.nv], [model.nq], axis=1)
+        qpos, qvel, _ = np.split(state[:, -1, 1:], [model.nq, model.nq + model.nv], axis=1)
+        return qpos, qvel
 
     return play
 
@@ -126,12 +130,15 @@ def by_device_code(model: Any, settings: Settings, real: str, folder: Path) -> P
     source = folder / f"{real}.cpp"
     library = folder / f"{real}.so"
     program = Path(__file__).with_name("one_lane.h").read_text("utf-8")
-    source.write_text(f"#define REAL {real}\n#define REPORTS 0\n#define VECTORS 1\n{text}{program}", "utf-8")
+    source.write_text(
+        f"#define REAL {real}\n#define REPORTS 0\n#define VECTORS 1\n{text}{program}", "utf-8"
+    )
     options = [*settings.options, "-std=c++17", "-w", "-shared", "-fPIC"]
-    began = time.perf_counter()
+    start_time = time.perf_counter()
     subprocess.run([str(COMPILER), *options, str(source), "-o", str(library)], check=True)
     code = ctypes.CDLL(str(library))
-    print(f"{real}: {time.perf_counter() - began:.0f} s to compile, {code.memory_size()} bytes")
+    compile_seconds = time.perf_counter() - start_time
+    print(f"{real}: {compile_seconds:.0f} s to compile, {code.memory_size():,} bytes an episode")
     memories = [np.zeros(code.memory_size() // 8 + 8) for _ in range(settings.threads)]
     pool = concurrent.futures.ThreadPoolExecutor(settings.threads)
 
@@ -155,8 +162,27 @@ def error(shown: tuple[Any, Any], expected: tuple[Any, Any]) -> float:
     return float(np.median((np.abs(x - y) / np.maximum(1, np.abs(y))).max(1)))
 
 
-def measure(path: Path, settings: Settings, temporary: str) -> list[str]:
-    """Returns a row of the table: a robot's speed by C, and what the others are beside it."""
+class Measured(NamedTuple):
+    """What was measured of a robot.
+
+    rate: physics steps per second of the CPU by ``rollout``
+    ratios: of the others' rates to it: ``Batch``, float64, float32
+    errors: of the same
+    """
+
+    rate: float
+    ratios: list[float]
+    errors: list[float]
+
+
+def measure(path: Path, settings: Settings, folder: Path) -> Measured:
+    """Measures a robot.
+
+    Args:
+      path: of its scene.
+      settings: of the run.
+      folder: for texts and libraries.
+    """
     model = load(path)
     data = mujoco.MjData(model)
     if model.nkey:
@@ -164,38 +190,43 @@ def measure(path: Path, settings: Settings, temporary: str) -> list[str]:
     random = np.random.default_rng(0)
     count = settings.episodes
     qpos = np.tile(data.qpos, (count, 1))
-    qvel = 0.1 * random.standard_normal((count, model.nv))
+    qvel = _SPREAD * random.standard_normal((count, model.nv))
     is_limited = model.actuator_ctrllimited.astype(bool)[:, None]
     low, high = np.where(is_limited, model.actuator_ctrlrange, (-1.0, 1.0)).T
     ctrl = random.uniform(low, high, (count, settings.env_steps, model.nu))
-    num_steps = count * settings.env_steps * settings.skip
-    folder = Path(tempfile.mkdtemp(dir=temporary))
-    code = functools.partial(by_device_code, model, settings, folder=folder)
     players = [by_rollout(model, settings), by_batch(model, settings)]
-    players += [code("double"), code("float")]
-    few = ctrl[:, : _FEW_STEPS // settings.skip].copy()
+    players += [by_device_code(model, settings, real, folder) for real in ("double", "float")]
+    # Of one length of memory: the device code reads it as it lies.
+    few = ctrl[:, : -(-_FEW_STEPS // settings.skip)].copy()
     ends = [play(qpos, qvel, few) for play in players]
-    errors = [error(end, ends[0]) for end in ends[1:]]
     seconds = []
     for _ in range(settings.repeats):
         turn = []
         for play in players:
-            began = time.process_time()
+            start_time = time.process_time()
             play(qpos, qvel, ctrl)
-            turn.append(time.process_time() - began)
+            turn.append(time.process_time() - start_time)
         seconds.append(turn)
-    ratios = [statistics.median(turn[0] / turn[n] for turn in seconds) for n in range(1, 4)]
-    rate = num_steps / statistics.median(turn[0] for turn in seconds)
-    cells = [f"{ratio:.2f} ({x:.0e})" for ratio, x in zip(ratios, errors, strict=True)]
-    return [str(path.relative_to(settings.folder)), f"{rate:.3g}", *cells]
+    num_steps = count * settings.env_steps * settings.skip
+    return Measured(
+        num_steps / statistics.median(turn[0] for turn in seconds),
+        [statistics.median(turn[0] / turn[n] for turn in seconds) for n in (1, 2, 3)],
+        [error(end, ends[0]) for end in ends[1:]],
+    )
 
 
 def main() -> None:
     """Prints the table."""
     settings = tyro.cli(Settings, description=__doc__)
-    with tempfile.TemporaryDirectory() as folder:
-        rows = [measure(settings.folder / robot, settings, folder) for robot in settings.robots]
-    print(f"{settings.threads} threads of {os.cpu_count()} cores, {' '.join(settings.options)}")
+    rows = []
+    with tempfile.TemporaryDirectory() as temporary:
+        for robot in settings.robots:
+            # Each has a folder: a library's file may not change while it is loaded.
+            folder = Path(tempfile.mkdtemp(dir=temporary))
+            measured = measure(settings.folder / robot, settings, folder)
+            pairs = zip(measured.ratios, measured.errors, strict=True)
+            rows.append([robot, f"{measured.rate:.3g}", *(f"{x:.2f} ({e:.0e})" for x, e in pairs)])
+    print(f"{settings.threads} threads of {num_cores()} cores, {' '.join(settings.options)}")
     print(table(("scene", "rollout (steps/s)", "Batch", "float64", "float32"), rows))
 
 
