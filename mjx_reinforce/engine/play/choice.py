@@ -113,7 +113,9 @@ def choose(
 
 def teams_may_play(name: str, env: Environment) -> bool:
     """Returns whether an engine of this name lets teams of lanes try, also what MJX refuses."""
-    is_here = name in ("auto", "native") and available.platform() == "gpu"
+    is_here = name in ("auto", "native") and (
+        available.platform() == "gpu" or program.has_one_lane(env)
+    )
     return is_here and not available.unavailable() and team.why_not(env) is None
 
 

@@ -74,7 +74,16 @@ def native_rollout(
     # Empty leaves have no buffer: the kernels count buffers, see ``kernel.queue_text``.
     parameters = [x.reshape(-1) for x in jax.tree.leaves(actor) if x.size]
     starts = [stored(x).reshape(num_episodes, -1) for x in jax.tree.leaves(state) if x.size]
-    if isinstance(program.code, machine.Code):
+    if program.episodes_last and isinstance(program.code, machine.Code):
+        shapes = _last_shapes(program, horizon, num_episodes)
+        outputs = cpu.call(
+            program.code, shapes, limits, jnp.int32(threads), words, *parameters, *starts
+        )
+        observation, action, rewards, length, is_broken, simulated = outputs
+        observation, action = (jnp.swapaxes(x, 1, 2) for x in (observation, action))
+        rewards = rewards.reshape(horizon, 1 + len(program.terms), num_episodes)
+        reward, *term_rewards = jnp.unstack(rewards, axis=1)
+    elif isinstance(program.code, machine.Code):
         shapes = _result_shapes(program, horizon, num_episodes)
         num_threads = jnp.int32(threads)
         outputs = cpu.call(program.code, shapes, limits, num_threads, words, *parameters, *starts)
@@ -103,7 +112,9 @@ def native_rollout(
 def _begin(env: Environment, program: NativeProgram, keys: jax.Array) -> tuple[Any, jax.Array]:
     """Returns the starts of episodes by their keys [N], and the keys [N] of their noise."""
     vmap_begin = jax.vmap(functools.partial(episode.begin, env))
-    is_for_one = isinstance(program.code, machine.Code) or program.code.launch.lanes == 1
+    is_for_one = not program.episodes_last
+    if is_for_one and not isinstance(program.code, machine.Code):
+        is_for_one = program.code.launch.lanes == 1
     if is_for_one and not _settles(env):
         return vmap_begin(keys)
 
@@ -146,6 +157,24 @@ def unsupported(
     except Exception as error:  # whatever it is, another engine may play this
         return refusal(error)
     return None
+
+
+def _last_shapes(
+    program: NativeProgram, horizon: int, num_episodes: int
+) -> list[jax.ShapeDtypeStruct]:
+    """Returns the shapes of what a call returns whose records have the episodes last."""
+    shape = jax.ShapeDtypeStruct
+    observation, action, reward = program.record
+    sizes = [int(np.prod(x.shape, dtype=int)) for x in program.record]
+    flags = shape((num_episodes,), jnp.int32)
+    return [
+        shape((horizon, sizes[0], num_episodes), observation.dtype),
+        shape((horizon, sizes[1], num_episodes), action.dtype),
+        shape((horizon, sizes[2] * num_episodes), reward.dtype),
+        flags,
+        flags,
+        shape((), jnp.int32),
+    ]
 
 
 def _result_shapes(

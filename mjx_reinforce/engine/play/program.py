@@ -20,7 +20,7 @@ from mjx_reinforce.engine.base import (
     term_names,
 )
 from mjx_reinforce.engine.checks import explain
-from mjx_reinforce.engine.cpu import handler, kernel, machine
+from mjx_reinforce.engine.cpu import cxx, handler, kernel, machine
 from mjx_reinforce.engine.cpu import seam as cpu_seam
 from mjx_reinforce.engine.gpu import cubin, team_kernel, thread_kernel
 from mjx_reinforce.engine.gpu import seam as gpu_seam
@@ -142,6 +142,13 @@ class NativeProgram(NamedTuple):
     code: machine.Code | cubin.Kernel
     record: list[jax.ShapeDtypeStruct]
     terms: tuple[str, ...]
+    episodes_last: bool = False
+
+
+def has_one_lane(env: Any) -> bool:
+    """Returns whether the device code with one lane plays on this CPU what C MuJoCo plays else."""
+    is_here = available.platform() == "cpu" and cxx.compiler() is not None
+    return is_here and c_mujoco.why_best(env) is not None and team.why_not(env) is None
 
 
 def build_program(
@@ -163,7 +170,8 @@ def build_program(
     examples = step_shapes(env, actor)
     function = step_function(env, act, distribution, length)
     # A lane of a vector computes steps also where it has no episode; a thread of a GPU does not.
-    if available.platform() != "cpu":
+    one_lane = has_one_lane(env)
+    if available.platform() != "cpu" or one_lane:
         function = while_running(function)
         examples = examples[:-1]
     num_actor = len(jax.tree.leaves(actor))
@@ -183,7 +191,7 @@ def build_program(
         functools.partial(team_kernel.player_text, num_actor=num_actor),
     )
     code, shapes = load("play", env, function, examples, writers, name_of(env))
-    return NativeProgram(code, shapes.record, term_names(env))
+    return NativeProgram(code, shapes.record, term_names(env), has_one_lane(env))
 
 
 class Writers(NamedTuple):
@@ -223,6 +231,8 @@ def load(
       TooLarge: writing it out and compiling it would take minutes.
       UnsupportedPrimitive: it has an operation that cannot be written.
     """
+    if env is not None and has_one_lane(env):
+        return _by_one_lane(job, env, function, examples, writers, name)
     target = machine.this_machine() if available.platform() == "cpu" else None
     unrolled = SCANS
     if target is None:
@@ -313,6 +323,60 @@ def _by_teams(
         except (scalar.UnsupportedPrimitive, scalar.TooLarge, NotImplementedError) as error:
             warnings.warn(f"a thread plays an episode, slower than lanes: {error}", stacklevel=2)
             return None
+
+
+def _by_one_lane(
+    job: str,
+    env: Any,
+    function: Callable[..., Any],
+    examples: Sequence[PyTree],
+    writers: Writers,
+    name: str,
+) -> tuple[machine.Code, Any]:
+    """Returns what ``load`` does, for the device code with one lane."""
+    model = team.physics_model(env)
+    assert model is not None
+    target = machine.this_machine()
+    with base.keeping_whole():
+        traced, shapes = scalarized.trace(function, *examples)
+        physics = team.team_physics(model)
+        source = f"{jaxprs.fingerprint(traced)} {physics} {objects.source_digest(*_WRITERS)}"
+        in_avals = []
+        out_avals = []
+
+        def write() -> str:
+            expansion = _write_out(traced, shapes)
+            kernel_source = _titled(writers.team(expansion, physics), name, expansion)
+            in_avals.extend(expansion.in_avals)
+            out_avals.extend(expansion.out_avals)
+            ins = [x for x in expansion.in_avals if np.prod(x.shape)]
+            outs = [x for x in expansion.out_avals if np.prod(x.shape)]
+            if job == "map":
+                sizes = [[x.size * np.dtype(x.dtype).itemsize for x in xs] for xs in (ins, outs)]
+                return cxx.text_of(kernel_source, cxx.map_work(*sizes))
+            # Keys, t and deterministic are the handler's own.
+            return cxx.text_of(kernel_source, cxx.play_work(len(ins) - 3, 6))
+
+        def compile(text: str, target: machine.Machine) -> bytes:
+            ins = [x for x in in_avals if np.prod(x.shape)]
+            outs = [x for x in out_avals if np.prod(x.shape)]
+            if job == "map":
+                sizes = [np.dtype(x.dtype).itemsize for x in outs]
+                entry = handler.handler_text(1 + len(ins), sizes, 1, kernel.MAPPING, is_zeroed=False)
+            else:
+                sizes = [np.dtype(x.dtype).itemsize for x in outs[: kernel.NUM_RECORDS]]
+                entry = handler.handler_text(len(ins), [*sizes, 4, 4, 4], 1)
+            return cxx.compiled(text, f"{entry}\ndeclare void @work(ptr)\n", target)
+
+        code = machine.load_module(
+            f"{job} {cxx.version()} {source}",
+            write,
+            handler.SYMBOLS,
+            target,
+            objects.folder(),
+            compile,
+        )
+        return code, shapes
 
 
 def machine_map(

@@ -10,6 +10,7 @@ typedef float real;
 #else
 #include <cmath>
 #include <cstddef>
+#include <cstdlib>
 #include <cstring>
 #define DEV inline
 #define CALL static inline
