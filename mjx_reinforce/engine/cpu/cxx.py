@@ -1,8 +1,7 @@
-"""Machine code of the device code of teams, with one lane, by the C++ compiler of this system.
+"""Machine code by this system's C++ compiler: kernels of teams of one lane, on a CPU.
 
-A text is a kernel as for a GPU; what is here makes of it ``@work`` of a handler in LLVM IR
-(``handler.ll``), which the threads of a job call. Both objects become one, which is kept and
-linked as any other.
+A text is C++ and, behind it, the handler that calls it (``handler.py``), in LLVM IR. Both objects
+become one, which is kept and linked as any other.
 """
 
 import functools
@@ -10,22 +9,42 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from mjx_reinforce.engine.cpu import emit, machine
-from mjx_reinforce.engine.gpu.source import Source
+import jax
+import numpy as np
 
-#: What the compiler is told: as C, it may leave out that functions set errno.
+from mjx_reinforce.engine.cpu import emit, handler, kernel, machine
+from mjx_reinforce.engine.gpu.loops import RESULTS
+from mjx_reinforce.engine.gpu.source import Source
+from mjx_reinforce.engine.scalar import scalarized
+
+#: No function sets errno, and nothing unwinds the stack.
 _OPTIONS = ("-std=c++17", "-O3", "-fPIC", "-w", "-fno-math-errno", "-fno-trapping-math")
 _OPTIONS += ("-fno-exceptions", "-fno-rtti", "-fno-asynchronous-unwind-tables", "-fno-plt")
-_TOOLS = Path(__file__).with_name("work.h")
+_MACROS = "#define REAL float\n#define VECTORS 1\n"
+_WORK = Path(__file__).with_name("work.h")
+#: Between the C++ and the handler.
+_BORDER = "// The handler, in LLVM IR.\n"
+#: A kernel's arguments behind the arrays of a step: keys, t and whether it is deterministic.
+_NUM_OTHERS = 3
+_NUM_RECORDS = kernel.NUM_RECORDS
 
 
 @functools.cache
 def compiler() -> str | None:
-    """Returns the path of a C++ compiler; None where there is none."""
-    return shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+    """Returns the path of a C++ compiler that makes kernels here; None where there is none."""
+    for name in ("c++", "g++", "clang++"):
+        path = shutil.which(name)
+        if path is not None:
+            try:
+                with tempfile.TemporaryDirectory() as folder:
+                    _object(path, 'extern "C" int one() { return 1; }', Path(folder))
+            except RuntimeError:
+                continue
+            return path
+    return None
 
 
 @functools.cache
@@ -35,92 +54,118 @@ def version() -> str:
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout
 
 
-def text_of(source: Source, work: str) -> str:
-    """Returns the C++ of a kernel for one lane.
+def player_text(program: scalarized.Scalarized, source: Source) -> str:
+    """Returns the text of a kernel that plays.
+
+    Its arguments and results are those of ``handler.handler_text``, but that its records are
+    observation [*B, T, O, N], action [*B, T, A, N] and reward [*B, T, (1 + K) N].
 
     Args:
-      source: the kernel.
-      work: the body of ``work``, which calls ``play``.
+      program: a step, written out.
+      source: the kernel, of ``loops.play_loop``.
     """
-    macros = "#define REAL float\n#define VECTORS 1\n"
-    tools = _TOOLS.read_text("utf-8")
-    # What C++ has on a GPU alone comes first.
-    return f"{macros}{tools}{source.for_compiler()}\n{work}"
+    num_inputs = len(_filled(program.in_avals)) - _NUM_OTHERS
+    first_result = kernel.NUM_CONTROLS + num_inputs
+    # The number of threads, of which the kernel knows nothing, is behind the limits.
+    inputs = [handler.LIMITS, *range(handler.KEYS, first_result)]
+    # It writes the results in place, which are zero: what it does not read of them has no place.
+    # The item to be fetched next, the last result, is the job's.
+    results = [*range(first_result, first_result + len(RESULTS) - 1)]
+    places = [f"buffers[{k}]" for k in inputs] + ["Buffer{}"] * len(RESULTS)
+    places += [f"buffers[{k}]" for k in results]
+    calls = f"""
+    const int sizes[] = {{int(job->total / job->episodes), int(job->episodes), int(job->horizon)}};
+    play(sizes, {", ".join(places)}, reinterpret_cast<int*>(&job->next), room.item);"""
+    sizes = [np.dtype(x.dtype).itemsize for x in program.out_avals[:_NUM_RECORDS]]
+    return _text(source, calls, handler.handler_text(first_result, [*sizes, 4, 4, 4]))
 
 
-def play_work(num_inputs: int, num_results: int) -> str:
-    """Returns the part of the C++ that plays; see ``loops.play_loop``.
+def mapping_text(program: scalarized.Scalarized, source: Source) -> str:
+    """Returns the text of a kernel that maps; its arguments are as of ``kernel.mapping_text``.
 
     Args:
-      num_inputs: arrays of the actor and the state.
-      num_results: how many arrays ``play`` writes besides the number of the next item.
+      program: the function, written out.
+      source: the kernel, of ``loops.map_loop``.
     """
-    # The number of threads, of which ``play`` knows nothing, is behind the limits.
-    inputs = [f"d[{k}]" for k in (0, *range(2, 3 + num_inputs))]
-    zeros = ["Any{}"] * (num_results + 1)
-    results = [f"d[{3 + num_inputs + k}]" for k in range(num_results)]
-    arguments = ", ".join([*inputs, *zeros, *results])
-    return (
-        "CALLED work(Job* job) {\n"
-        "  const int sizes[] = {int(job->total / job->episodes), int(job->episodes), "
-        "int(job->horizon)};\n"
-        "  const Any* d = job->data;\n"
-        "  const Room<Word> room(size_t(THREAD_WORDS) * W + 1);\n"
-        # The lower half of the number of the next item: there are fewer than 2^31.
-        f"  play(sizes, {arguments}, reinterpret_cast<int*>(&job->next), room.item);\n"
-        "}\n"
-    )
+    inputs, results = _filled(program.in_avals), _filled(program.out_avals)
+    places = [
+        f"buffers[{number}].behind(k * {x.size * np.dtype(x.dtype).itemsize})"
+        for number, x in enumerate([*inputs, *results], start=1)
+    ]
+    calls = f"""
+    const int sizes[] = {{1}};
+    long long k;
+    while ((k = __atomic_fetch_add(&job->next, 1, __ATOMIC_RELAXED)) < job->total)
+      play(sizes, {", ".join(places)}, room.item);"""
+    sizes = [np.dtype(x.dtype).itemsize for x in results]
+    entry = handler.handler_text(1 + len(inputs), sizes, positions=kernel.MAPPING, is_zeroed=False)
+    return _text(source, calls, entry)
 
 
-def map_work(input_bytes: Sequence[int], result_bytes: Sequence[int]) -> str:
-    """Returns the part of the C++ that maps; see ``loops.map_loop``.
+def _filled(avals: Iterable[jax.ShapeDtypeStruct]) -> list[jax.ShapeDtypeStruct]:
+    """Returns the arrays that are not empty: XLA passes no others."""
+    return [x for x in avals if np.prod(x.shape)]
+
+
+def _text(source: Source, calls: str, entry: str) -> str:
+    """Returns a text.
 
     Args:
-      input_bytes: of an example in each argument.
-      result_bytes: of an example in each result.
+      source: a kernel.
+      calls: the lines that call it, of a job.
+      entry: the handler.
     """
-    rows = [*input_bytes, *result_bytes]
-    arguments = ", ".join(f"d[{k}].from(k * {size}ll)" for k, size in enumerate(rows, start=1))
-    return (
-        "CALLED work(Job* job) {\n"
-        "  const int sizes[] = {1};\n"
-        "  const Any* d = job->data;\n"
-        "  const Room<Word> room(size_t(THREAD_WORDS) * W + 1);\n"
-        "  long long k;\n"
-        "  while ((k = __atomic_fetch_add(&job->next, 1, __ATOMIC_RELAXED)) < job->total)\n"
-        f"    play(sizes, {arguments}, room.item);\n"
-        "}\n"
-    )
+    work = _WORK.read_text("utf-8").replace("// calls\n", f"{calls}\n")
+    head, _, tail = work.partition("// The kernel.\n")
+    flush = handler.flush(machine.this_machine().triple)
+    return f"{head}{_MACROS}{source.for_compiler()}\n{tail}{_BORDER}{entry}{flush}{_WORK_IR}"
 
 
-def compiled(text: str, handler: str, target: machine.Machine) -> bytes:
-    """Returns the object of a text and its handler.
+#: What a thread of a job does.
+_WORK_IR = """
+declare void @work_here(ptr)
+define void @work(ptr %job) {
+  %control = call i64 @flush()
+  call void @work_here(ptr %job)
+  call void @unflush(i64 %control)
+  ret void
+}
+"""
 
-    Args:
-      text: C++.
-      handler: LLVM IR.
-      target: what to compile for.
+
+def compiled(text: str, target: machine.Machine) -> bytes:
+    """Returns the object of a text.
 
     Raises:
-      RuntimeError: the compiler or the linker refuses it.
+      RuntimeError: the compiler refuses it.
     """
-    level = os.environ.get(machine.VARIABLE) or machine.HOST
-    march = "native" if level == machine.HOST else level
+    program, _, entry = text.partition(_BORDER)
+    path = str(compiler())
     with tempfile.TemporaryDirectory() as folder:
-        objects = [f"{folder}/work.o", f"{folder}/handler.o"]
-        source = Path(folder, "work.cpp")
-        source.write_text(text, "utf-8")
-        _run([*_OPTIONS, f"-march={march}", "-c", str(source), "-o", objects[0]])
+        kernel_object = _object(path, program, Path(folder))
         llvm = emit.target_machine(target.triple, target.cpu, target.features, 2)
-        Path(objects[1]).write_bytes(llvm.emit_object(emit.parse(handler, llvm)))
-        _run(["-r", "-nostdlib", *objects, "-o", f"{folder}/both.o"])
-        return Path(folder, "both.o").read_bytes()
+        handler_object = Path(folder, "handler.o")
+        handler_object.write_bytes(llvm.emit_object(emit.parse(entry, llvm)))
+        joint_object = Path(folder, "joint.o")
+        # A relocatable object of both, not a library: LLVM puts it into memory.
+        options = ("-r", "-nostdlib", "-o", str(joint_object))
+        _run(path, [*options, str(kernel_object), str(handler_object)])
+        return joint_object.read_bytes()
 
 
-def _run(arguments: Sequence[str]) -> None:
-    """Runs the compiler."""
-    done = subprocess.run(
-        [str(compiler()), *arguments], capture_output=True, text=True, check=False
-    )
+def _object(path: str, program: str, folder: Path) -> Path:
+    """Returns where the object of a C++ program is, in a folder; see ``compiled``."""
+    level = os.environ.get(machine.VARIABLE) or machine.HOST
+    source = folder / "kernel.cpp"
+    source.write_text(program, "utf-8")
+    place = source.with_suffix(".o")
+    march = f"-march={'native' if level == machine.HOST else level}"
+    _run(path, [*_OPTIONS, march, "-c", str(source), "-o", str(place)])
+    return place
+
+
+def _run(path: str, arguments: Sequence[str]) -> None:
+    """Runs a compiler."""
+    done = subprocess.run([path, *arguments], capture_output=True, text=True, check=False)
     if done.returncode:
-        raise RuntimeError(f"the C++ compiler refuses a kernel: {done.stderr[:1000]}")
+        raise RuntimeError(f"{path} refuses a kernel: {done.stderr[:1000]}")

@@ -189,6 +189,7 @@ def build_program(
         write_cpu,
         functools.partial(thread_kernel.player_text, num_actor=num_actor),
         functools.partial(team_kernel.player_text, num_actor=num_actor),
+        cxx.player_text,
     )
     code, shapes = load("play", env, function, examples, writers, name_of(env))
     return NativeProgram(code, shapes.record, term_names(env), has_one_lane(env))
@@ -200,11 +201,13 @@ class Writers(NamedTuple):
     cpu: what is written out, and for which machine -> LLVM IR
     gpu: what is written out -> CUDA C++, for a thread an episode
     team: what is written out, and with which physics -> CUDA C++, for several lanes an episode
+    lane: what is written out, and that C++ -> the text of ``cxx.compiled``, for one lane
     """
 
     cpu: Callable[[scalarized.Scalarized, machine.Machine], str]
     gpu: Callable[[scalarized.Scalarized], Source]
     team: Callable[[scalarized.Scalarized, team_kernel.Physics], Source]
+    lane: Callable[[scalarized.Scalarized, Source], str]
 
 
 def load(
@@ -336,45 +339,21 @@ def _by_one_lane(
     """Returns what ``load`` does, for the device code with one lane."""
     model = team.physics_model(env)
     assert model is not None
-    target = machine.this_machine()
     with base.keeping_whole():
         traced, shapes = scalarized.trace(function, *examples)
         physics = team.team_physics(model)
-        source = f"{jaxprs.fingerprint(traced)} {physics} {objects.source_digest(*_WRITERS)}"
-        in_avals = []
-        out_avals = []
+        dependencies = (cxx.version(), physics, objects.source_digest(*_WRITERS))
+        source = f"{job} {jaxprs.fingerprint(traced)} {dependencies}"
 
         def write() -> str:
             expansion = _write_out(traced, shapes)
-            kernel_source = _titled(writers.team(expansion, physics), name, expansion)
-            in_avals.extend(expansion.in_avals)
-            out_avals.extend(expansion.out_avals)
-            ins = [x for x in expansion.in_avals if np.prod(x.shape)]
-            outs = [x for x in expansion.out_avals if np.prod(x.shape)]
-            if job == "map":
-                sizes = [[x.size * np.dtype(x.dtype).itemsize for x in xs] for xs in (ins, outs)]
-                return cxx.text_of(kernel_source, cxx.map_work(*sizes))
-            # Keys, t and deterministic are the handler's own.
-            return cxx.text_of(kernel_source, cxx.play_work(len(ins) - 3, 6))
+            return writers.lane(
+                expansion, _titled(writers.team(expansion, physics), name, expansion)
+            )
 
-        def compile(text: str, target: machine.Machine) -> bytes:
-            ins = [x for x in in_avals if np.prod(x.shape)]
-            outs = [x for x in out_avals if np.prod(x.shape)]
-            if job == "map":
-                sizes = [np.dtype(x.dtype).itemsize for x in outs]
-                entry = handler.handler_text(1 + len(ins), sizes, 1, kernel.MAPPING, is_zeroed=False)
-            else:
-                sizes = [np.dtype(x.dtype).itemsize for x in outs[: kernel.NUM_RECORDS]]
-                entry = handler.handler_text(len(ins), [*sizes, 4, 4, 4], 1)
-            return cxx.compiled(text, f"{entry}\ndeclare void @work(ptr)\n", target)
-
+        target = machine.this_machine()
         code = machine.load_module(
-            f"{job} {cxx.version()} {source}",
-            write,
-            handler.SYMBOLS,
-            target,
-            objects.folder(),
-            compile,
+            source, write, handler.SYMBOLS, target, objects.folder(), cxx.compiled
         )
         return code, shapes
 
@@ -417,7 +396,9 @@ def machine_map(
     for leaf in stored_arguments + stored_results:
         if np.dtype(leaf.dtype).itemsize not in (4, 8):
             raise TypeError(f"it has numbers of {leaf.dtype}, not of 32 or 64 bits")
-    writers = Writers(_write_cpu, thread_kernel.mapping_text, team_kernel.mapping_text)
+    writers = Writers(
+        _write_cpu, thread_kernel.mapping_text, team_kernel.mapping_text, cxx.mapping_text
+    )
     code, _ = load("map", env, flat, stored_arguments, writers, name)
 
     def map_rows(*args: PyTree) -> Any:

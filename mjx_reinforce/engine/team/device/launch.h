@@ -54,7 +54,8 @@ struct Player : Team {
 // Memory of one thread, until its block ends.
 template <class T> struct Room {
   T* item;
-  explicit Room(size_t count) : item(static_cast<T*>(aligned_alloc(64, (count * sizeof(T) + 63) / 64 * 64))) {}
+  explicit Room(size_t count)
+      : item(static_cast<T*>(aligned_alloc(64, (count * sizeof(T) + 63) / 64 * 64))) {}
   ~Room() { free(item); }
 };
 #define OWN_PLACE                        \
