@@ -147,8 +147,10 @@ class NativeProgram(NamedTuple):
 
 def has_one_lane(env: Any) -> bool:
     """Returns whether the device code with one lane plays on this CPU what C MuJoCo plays else."""
-    is_here = available.platform() == "cpu" and cxx.compiler() is not None
-    return is_here and c_mujoco.why_best(env) is not None and team.why_not(env) is None
+    if available.platform() != "cpu" or jax.config.values["jax_enable_x64"]:
+        return False  # it is in float32
+    is_best = c_mujoco.why_best(env) is not None and team.why_not(env) is None
+    return is_best and cxx.compiler() is not None
 
 
 def build_program(
