@@ -20,12 +20,12 @@ from mjx_reinforce.engine.base import (
     term_names,
 )
 from mjx_reinforce.engine.checks import explain
-from mjx_reinforce.engine.cpu import cxx, handler, kernel, machine
+from mjx_reinforce.engine.cpu import handler, kernel, machine
 from mjx_reinforce.engine.cpu import seam as cpu_seam
 from mjx_reinforce.engine.gpu import cubin, team_kernel, thread_kernel
 from mjx_reinforce.engine.gpu import seam as gpu_seam
 from mjx_reinforce.engine.gpu.source import Source
-from mjx_reinforce.engine.play import available, c_mujoco
+from mjx_reinforce.engine.play import available, c_mujoco, cxx
 from mjx_reinforce.engine.play import teams as team
 from mjx_reinforce.engine.play.counter import at_counter, split
 from mjx_reinforce.engine.scalar import jaxprs, scalarized
@@ -137,6 +137,7 @@ class NativeProgram(NamedTuple):
     code: of ``seam.call`` on a CPU, of ``seam.launch`` on a GPU
     record: shape and dtype of the observation, the action and the reward of a step
     terms: names of the reward's terms, which are recorded behind it
+    episodes_last: whether the records are [T, numbers, N], and not [T, N, numbers]
     """
 
     code: machine.Code | cubin.Kernel
@@ -194,7 +195,8 @@ def build_program(
         cxx.player_text,
     )
     code, shapes = load("play", env, function, examples, writers, name_of(env))
-    return NativeProgram(code, shapes.record, term_names(env), has_one_lane(env))
+    episodes_last = isinstance(code, cubin.Kernel) or one_lane
+    return NativeProgram(code, shapes.record, term_names(env), episodes_last)
 
 
 class Writers(NamedTuple):
