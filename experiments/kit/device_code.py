@@ -42,6 +42,8 @@ def compiled(
     num_near: int = tables.NUM_NEAR,
     lanes: int = 1,
     random: Collection[str] = (),
+    *,
+    vectors: bool = False,
 ) -> Steps:
     """Returns what plays a model's physics steps.
 
@@ -51,6 +53,7 @@ def compiled(
       num_near: contacts that the state of a team has room for.
       lanes: of the team; several take turns, see ``turns.h``.
       random: the names of fields of the model that differ from episode to episode.
+      vectors: whether the only lane computes by whole rows, see ``vectors.h``.
 
     Raises:
       UnsupportedPrimitive: the device code lacks something that the model has.
@@ -67,7 +70,8 @@ def compiled(
     program = (kit / "play_steps.h").read_text("utf-8")
     source = folder / "play.cpp"
     library = folder / "play.so"
-    source.write_text(f"#define W {lanes}\n#define RUN {run}\n{text}{program}", "utf-8")
+    macros = f"#define W {lanes}\n#define VECTORS {int(vectors)}\n#define RUN {run}\n"
+    source.write_text(f"{macros}{text}{program}", "utf-8")
     options = ["-O0", "-std=c++17", "-w", "-shared", "-fPIC"]
     subprocess.run([str(COMPILER), *options, str(source), "-o", str(library)], check=True)
     play_steps = ctypes.CDLL(str(library)).play_steps

@@ -124,6 +124,7 @@ def load_module(
     functions: tuple[str, ...],
     machine: Machine,
     folder: Path | None,
+    compile: Callable[[str, Machine], bytes] | None = None,
 ) -> Code:
     """Returns the functions of a module, compiled unless memory or disk has them.
 
@@ -135,6 +136,7 @@ def load_module(
       functions: the functions to be found in ``addresses``.
       machine: what to compile for.
       folder: where compiled objects are kept; None keeps none.
+      compile: returns the object of a text that is no LLVM IR, and is another compiler's.
 
     Raises:
       RuntimeError: the text is no LLVM IR, or it calls a function that is nowhere; a long text's
@@ -147,13 +149,18 @@ def load_module(
             if object_code:
                 future = _done(_link(key, functions, object_code))
             else:
-                future = _make(key, write(), functions, machine, folder)
+                future = _make(key, write(), functions, machine, folder, compile)
             _CACHE[key] = Code(key, future, compiled=not object_code)
         return _CACHE[key]
 
 
 def _make(
-    key: str, text: str, functions: tuple[str, ...], machine: Machine, folder: Path | None
+    key: str,
+    text: str,
+    functions: tuple[str, ...],
+    machine: Machine,
+    folder: Path | None,
+    compile: Callable[[str, Machine], bytes] | None,
 ) -> Future[dict[str, int]]:
     """Returns where the functions of a module will be."""
 
@@ -161,6 +168,8 @@ def _make(
         data = objects.make(key, folder, text, lambda text: compile(text, machine))
         return _link(key, functions, data)
 
+    if compile:
+        return emit.later(lambda: finish(compile))
     # A program without Python's own executable, as one that embeds it, has no other process.
     if len(text) <= _LONG_TEXT or not sys.executable:
         return _done(finish(_compile))

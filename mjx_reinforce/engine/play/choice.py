@@ -89,7 +89,10 @@ def choose(
     def engine_in_c(task: Environment, reason: str) -> Engine:
         return Engine("mujoco", reason, _rollout_in_c(task), time.perf_counter() - start_time)
 
-    in_c = None if teams_may_play(name, env) else _in_c_mujoco(name, env)
+    # Without machine code for the whole episode, vmap would play on a CPU.
+    has_whole_episodes = policy is not None or available.platform() == "gpu"
+    is_for_teams = has_whole_episodes and teams_may_play(name, env)
+    in_c = None if is_for_teams else _in_c_mujoco(name, env)
     if in_c is not None:
         return engine_in_c(*in_c)
 
@@ -108,12 +111,16 @@ def choose(
             return engine_in_c(*in_c)
     if engine_name == "native" and available.platform() == "gpu":
         reason += f", {team.played_by(env)}"
+    elif engine_name == "native" and program.has_one_lane(env):
+        reason += ", made by the C++ compiler"
     return Engine(engine_name, reason, rollout, time.perf_counter() - start_time)
 
 
 def teams_may_play(name: str, env: Environment) -> bool:
     """Returns whether an engine of this name lets teams of lanes try, also what MJX refuses."""
-    is_here = name in ("auto", "native") and available.platform() == "gpu"
+    is_here = name in ("auto", "native") and (
+        available.platform() == "gpu" or program.has_one_lane(env)
+    )
     return is_here and not available.unavailable() and team.why_not(env) is None
 
 

@@ -6,6 +6,7 @@ to rounding.
 """
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -17,6 +18,7 @@ from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory
 from mjx_reinforce.engine.contract import check_shape
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.cpu import seam as cpu
+from mjx_reinforce.engine.gpu import cubin
 from mjx_reinforce.engine.gpu import seam as gpu
 from mjx_reinforce.engine.play import available, c_mujoco
 from mjx_reinforce.engine.play.counter import key_of_words
@@ -78,17 +80,26 @@ def native_rollout(
         shapes = _result_shapes(program, horizon, num_episodes)
         num_threads = jnp.int32(threads)
         outputs = cpu.call(program.code, shapes, limits, num_threads, words, *parameters, *starts)
-        observation, action, rewards, length, is_broken, simulated = outputs
-        rewards = rewards.reshape(horizon, num_episodes, 1 + len(program.terms))
-        reward, *term_rewards = jnp.unstack(rewards, axis=-1)
     else:
         outputs = gpu.launch(
             program.code, program.record, horizon, limits, words, *parameters, *starts
         )
-        # Threads of a warp write the same number of neighboring episodes at once: [T, numbers, N].
-        observation, action, rewards, length, is_broken, simulated = outputs
+    return _trajectory(program, outputs, horizon, num_episodes)
+
+
+def _trajectory(
+    program: NativeProgram, outputs: Sequence[jax.Array], horizon: int, num_episodes: int
+) -> Trajectory:
+    """Returns the episodes that a call has recorded."""
+    observation, action, rewards, length, is_broken, simulated = outputs
+    num_rewards = 1 + len(program.terms)
+    if program.episodes_last:  # [T, numbers, N]
         observation, action = (jnp.swapaxes(x, 1, 2) for x in (observation, action))
+        rewards = rewards.reshape(horizon, num_rewards, num_episodes)
         reward, *term_rewards = jnp.unstack(rewards, axis=1)
+    else:
+        rewards = rewards.reshape(horizon, num_episodes, num_rewards)
+        reward, *term_rewards = jnp.unstack(rewards, axis=-1)
     return Trajectory(
         observation=observation,
         action=action.reshape(horizon, num_episodes, *program.record[1].shape),
@@ -103,8 +114,10 @@ def native_rollout(
 def _begin(env: Environment, program: NativeProgram, keys: jax.Array) -> tuple[Any, jax.Array]:
     """Returns the starts of episodes by their keys [N], and the keys [N] of their noise."""
     vmap_begin = jax.vmap(functools.partial(episode.begin, env))
-    is_for_one = isinstance(program.code, machine.Code) or program.code.launch.lanes == 1
-    if is_for_one and not _settles(env):
+    has_team = program.episodes_last
+    if isinstance(program.code, cubin.Kernel):
+        has_team = program.code.launch.lanes > 1
+    if not has_team and not _settles(env):
         return vmap_begin(keys)
 
     # Teams of lanes start a large model, too: in XLA's reset its sums would be atomic on a GPU, and
@@ -154,11 +167,14 @@ def _result_shapes(
     """Returns the shapes of what a call returns; see ``handler.handler_text``."""
     shape = jax.ShapeDtypeStruct
     observation, action, reward = program.record
-    size, num_rewards = (int(np.prod(x.shape, dtype=int)) for x in (action, reward))
+    sizes = [int(np.prod(x.shape, dtype=int)) for x in program.record]
+    # The axes of an observation or an action beside those of steps.
+    rows = [(size, num_episodes)[:: 1 if program.episodes_last else -1] for size in sizes]
+    num_rewards = sizes[2]
     flags = shape((num_episodes,), jnp.int32)
     return [
-        shape((horizon, num_episodes, *observation.shape), observation.dtype),
-        shape((horizon, num_episodes, size), action.dtype),
+        shape((horizon, *rows[0]), observation.dtype),
+        shape((horizon, *rows[1]), action.dtype),
         # Of two axes: the handler reads T from it.
         shape((horizon, num_episodes * num_rewards), reward.dtype),
         flags,

@@ -25,7 +25,7 @@ from mjx_reinforce.engine.cpu import seam as cpu_seam
 from mjx_reinforce.engine.gpu import cubin, team_kernel, thread_kernel
 from mjx_reinforce.engine.gpu import seam as gpu_seam
 from mjx_reinforce.engine.gpu.source import Source
-from mjx_reinforce.engine.play import available, c_mujoco
+from mjx_reinforce.engine.play import available, c_mujoco, cxx
 from mjx_reinforce.engine.play import teams as team
 from mjx_reinforce.engine.play.counter import at_counter, split
 from mjx_reinforce.engine.scalar import jaxprs, scalarized
@@ -137,11 +137,21 @@ class NativeProgram(NamedTuple):
     code: of ``seam.call`` on a CPU, of ``seam.launch`` on a GPU
     record: shape and dtype of the observation, the action and the reward of a step
     terms: names of the reward's terms, which are recorded behind it
+    episodes_last: whether the records are [T, numbers, N], and not [T, N, numbers]
     """
 
     code: machine.Code | cubin.Kernel
     record: list[jax.ShapeDtypeStruct]
     terms: tuple[str, ...]
+    episodes_last: bool = False
+
+
+def has_one_lane(env: Any) -> bool:
+    """Returns whether the device code with one lane plays on this CPU what C MuJoCo plays else."""
+    if available.platform() != "cpu" or jax.config.values["jax_enable_x64"]:
+        return False  # it is in float32
+    is_best = c_mujoco.why_best(env) is not None and team.why_not(env) is None
+    return is_best and cxx.compiler() is not None
 
 
 def build_program(
@@ -163,7 +173,8 @@ def build_program(
     examples = step_shapes(env, actor)
     function = step_function(env, act, distribution, length)
     # A lane of a vector computes steps also where it has no episode; a thread of a GPU does not.
-    if available.platform() != "cpu":
+    one_lane = has_one_lane(env)
+    if available.platform() != "cpu" or one_lane:
         function = while_running(function)
         examples = examples[:-1]
     num_actor = len(jax.tree.leaves(actor))
@@ -181,9 +192,11 @@ def build_program(
         write_cpu,
         functools.partial(thread_kernel.player_text, num_actor=num_actor),
         functools.partial(team_kernel.player_text, num_actor=num_actor),
+        cxx.player_text,
     )
     code, shapes = load("play", env, function, examples, writers, name_of(env))
-    return NativeProgram(code, shapes.record, term_names(env))
+    episodes_last = isinstance(code, cubin.Kernel) or one_lane
+    return NativeProgram(code, shapes.record, term_names(env), episodes_last)
 
 
 class Writers(NamedTuple):
@@ -192,11 +205,13 @@ class Writers(NamedTuple):
     cpu: what is written out, and for which machine -> LLVM IR
     gpu: what is written out -> CUDA C++, for a thread an episode
     team: what is written out, and with which physics -> CUDA C++, for several lanes an episode
+    lane: what is written out, and that C++ -> the text of ``cxx.compiled``, for one lane
     """
 
     cpu: Callable[[scalarized.Scalarized, machine.Machine], str]
     gpu: Callable[[scalarized.Scalarized], Source]
     team: Callable[[scalarized.Scalarized, team_kernel.Physics], Source]
+    lane: Callable[[scalarized.Scalarized, Source], str]
 
 
 def load(
@@ -223,6 +238,8 @@ def load(
       TooLarge: writing it out and compiling it would take minutes.
       UnsupportedPrimitive: it has an operation that cannot be written.
     """
+    if env is not None and has_one_lane(env):
+        return _by_one_lane(job, env, function, examples, writers, name)
     target = machine.this_machine() if available.platform() == "cpu" else None
     unrolled = SCANS
     if target is None:
@@ -315,6 +332,36 @@ def _by_teams(
             return None
 
 
+def _by_one_lane(
+    job: str,
+    env: Any,
+    function: Callable[..., Any],
+    examples: Sequence[PyTree],
+    writers: Writers,
+    name: str,
+) -> tuple[machine.Code, Any]:
+    """Returns what ``load`` does, for the device code with one lane."""
+    model = team.physics_model(env)
+    assert model is not None
+    with base.keeping_whole():
+        traced, shapes = scalarized.trace(function, *examples)
+        physics = team.team_physics(model)
+        dependencies = (cxx.version(), physics, objects.source_digest(*_WRITERS))
+        source = f"{job} {jaxprs.fingerprint(traced)} {dependencies}"
+
+        def write() -> str:
+            expansion = _write_out(traced, shapes)
+            return writers.lane(
+                expansion, _titled(writers.team(expansion, physics), name, expansion)
+            )
+
+        target = machine.this_machine()
+        code = machine.load_module(
+            source, write, handler.SYMBOLS, target, objects.folder(), cxx.compiled
+        )
+        return code, shapes
+
+
 def machine_map(
     function: Callable[..., Any],
     *examples: PyTree,
@@ -353,7 +400,9 @@ def machine_map(
     for leaf in stored_arguments + stored_results:
         if np.dtype(leaf.dtype).itemsize not in (4, 8):
             raise TypeError(f"it has numbers of {leaf.dtype}, not of 32 or 64 bits")
-    writers = Writers(_write_cpu, thread_kernel.mapping_text, team_kernel.mapping_text)
+    writers = Writers(
+        _write_cpu, thread_kernel.mapping_text, team_kernel.mapping_text, cxx.mapping_text
+    )
     code, _ = load("map", env, flat, stored_arguments, writers, name)
 
     def map_rows(*args: PyTree) -> Any:

@@ -5,7 +5,7 @@ from typing import Any
 
 from mjx_reinforce.engine.base import PhysicsModel
 from mjx_reinforce.engine.gpu.team_kernel import FEW_WARPS, MANY_WARPS, Physics
-from mjx_reinforce.engine.play import c_mujoco
+from mjx_reinforce.engine.play import available, c_mujoco
 
 #: Models of fewer degrees of freedom play faster by a thread an episode, if one can play them.
 _LEAST_DOFS = 14
@@ -49,6 +49,14 @@ def team_physics(model: PhysicsModel) -> Physics:
     """Returns the physics of a model that teams play."""
     from mjx_reinforce.engine.team import tables
 
+    if available.platform() == "cpu":
+        return Physics(
+            text=tables.physics_text(model.mj_model, random=model.random),
+            far=tables.far_words(model.mj_model, random=model.random),
+            skip=model.frame_skip,
+            lanes=1,
+            shared=0,
+        )
     lanes = _lanes(model)
     # Where a lane has two rows of the Newton step's matrix it needs more registers than the threads
     # of many warps have, and as many states do not fit into shared memory.

@@ -29,6 +29,7 @@ needs_compiler = pytest.mark.skipif(device_code.COMPILER is None, reason="there 
 _OWN = str(Path(__file__).parents[3] / "experiments" / "examples" / "quadruped")
 _MODELS = tomllib.loads((Path(__file__).parent / "models.toml").read_text("utf-8"))
 _QUICK = ("limits", "condim 6 and 4", "elliptic cones, condim 1 and 3", "boxes on boxes", "3 steps")
+_VECTORS = ("limits", "elliptic cones, condim 1 and 3")
 _OF_MOCAP = [x for x in _MODELS["features"] if "mocap" in x]
 _MANY = '<geom size=".1"/>'
 _BOX = '<geom type="box" size=".1 .1 .1"/>'
@@ -123,9 +124,11 @@ def _numbers(m: Any, data: Any) -> np.ndarray:
         return np.array(tables.drawn_numbers(m, (), poses))
 
 
-def _largest_error(m: Any, folder: Any, skip: int, starts: int, near=tables.NUM_NEAR, lanes=1):
+def _largest_error(
+    m: Any, folder: Any, skip: int, starts: int, near=tables.NUM_NEAR, lanes=1, *, vectors=False
+):
     """Returns the largest error of steps along short episodes of random play."""
-    play = _compiled(m, folder, near, lanes)
+    play = _compiled(m, folder, near, lanes, vectors=vectors)
     rng, errors = np.random.default_rng(0), []
     for _ in range(starts):
         data = _C.MjData(m)
@@ -194,6 +197,29 @@ def test_features(feature, tmp_path):
 def test_a_search_that_stops_early_ends_where_c_ends(limits, tmp_path):
     m = _model(**_MODELS["early"][limits])
     assert _largest_error(m, tmp_path, skip=3, starts=3) < 1e-9
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("part", "feature"),
+    [
+        pytest.param(part, x, marks=[] if x in _VECTORS else pytest.mark.slow)
+        for part in ("features", "early")
+        for x in _MODELS[part]
+    ],
+)
+def test_one_lane_computes_in_vectors(part, feature, tmp_path):
+    m = _model(**_MODELS[part][feature])
+    m = _exact(m) if part == "features" else m
+    assert _largest_error(m, tmp_path, skip=3, starts=2, vectors=True) < 1e-9
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["humanoid", "humanoid_standup", _OWN])
+def test_tasks_in_vectors(task, tmp_path):
+    m = models.load_model(f"{task}.xml")
+    assert _largest_error(_exact(m), tmp_path, skip=5, starts=2, near=1, vectors=True) < 1e-9
 
 
 @needs_compiler

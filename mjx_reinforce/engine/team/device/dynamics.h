@@ -13,6 +13,13 @@ DEV void along_tree(const real* value, const Quad* by, real* out, int width) {
   }
 }
 
+// The six components of a spatial vector, by all lanes.
+DEV void along_tree_of(const Team& t, const real* entries, const Quad* by, real* out) {
+  const int lane = t.lane;
+  if (VECTORS) return along_tree_in_vectors(entries, by, out, 6);
+  EACH(k, 6) along_tree(entries + k, by, out + k, 6);
+}
+
 // Adds the force of the actuators of a degree of freedom or, after all of these, of a cable, and
 // how much they damp.
 DEV void drive(const Model& M, const State& s, int target, real position, real velocity,
@@ -63,7 +70,7 @@ DEV void motions(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
   const Quad *qvel = reinterpret_cast<const Quad*>(s.qvel),
              *x = reinterpret_cast<const Quad*>(s.qacc_warmstart);
-  EACH(k, 6) along_tree(&s.cdof[0][0].x[0] + k, qvel, &s.velocity[0][k], 6);
+  along_tree_of(t, &s.cdof[0][0].x[0], qvel, s.velocity[0]);
   t.sync();
   EACH(i, NV) {
     real moves[6], change[6] = {};
@@ -76,7 +83,11 @@ DEV void motions(const Team& t, const Model& M, State& s) {
   t.sync();
   // The acceleration that qvel brings, into the force's place, and that of x.
   real(*by_velocity)[20] = reinterpret_cast<real(*)[20]>(&s.subtree[0][0].x[0]);
-  EACH(k, 12) {
+  if (VECTORS) {
+    along_tree_in_vectors(&s.terms[0][0].x[0], qvel, &by_velocity[0][10], 20);
+    along_tree_in_vectors(&s.cdof[0][0].x[0], x, s.motion[0], 6);
+  }
+  EACH(k, VECTORS ? 0 : 12) {
     const bool first = k < 6;
     const real* value = first ? &s.terms[0][0].x[0] + k : &s.cdof[0][0].x[0] + (k - 6);
     real* out = first ? &by_velocity[0][10 + k] : &s.motion[0][k - 6];
@@ -105,7 +116,9 @@ DEV void forces_and_inertia(const Team& t, const Model& M, State& s) {
   t.sync();
   // From the leaves to the root: each link's inertia and force become those of its subtree. A lane
   // has one of their 16 numbers, and the tree is written out.
-  EACH(k, 16) {
+  for (int l = NL - 1; VECTORS && l > 0; l--)
+    for (int k = 0; k < 16 && link_parent(l) >= 0; k++) whole[link_parent(l)][k] += whole[l][k];
+  EACH(k, VECTORS ? 0 : 16) {
     real sum[NL];
     UNROLL for (int l = 0; l < NL; l++) sum[l] = whole[l][k];
     UNROLL for (int l = NL - 1; l > 0; l--)

@@ -241,8 +241,7 @@ DEV int newton_as_c(const Team& t, const Model& M, State& s) {
     }
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
       if (ISLANDS && !damps && !(island >> (t.lane + r * W) & 1)) search.gradient[r] = 0;
-    load_right_side(t, s, search, h);
-    solve(t, s, h, search.direction);
+    find_direction(t, s, search, h);
     if (damps) break;
     change_along(t, M, s);
     t.sync();

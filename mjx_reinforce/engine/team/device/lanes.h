@@ -10,6 +10,7 @@ typedef float real;
 #else
 #include <cmath>
 #include <cstddef>
+#include <cstdlib>
 #include <cstring>
 #define DEV inline
 #define CALL static inline
@@ -29,6 +30,11 @@ using std::sqrt;
 #ifndef W
 #define W 1
 #endif
+// Whether a compiler is to make vectors of the loops of the only lane; see vectors.h.
+#ifndef VECTORS
+#define VECTORS 0
+#endif
+static_assert(W == 1 || !VECTORS, "several lanes are no vectors");
 // The items of n that are this lane's.
 #define EACH(i, n) for (int i = lane; i < (n); i += W)
 

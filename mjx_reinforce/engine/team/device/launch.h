@@ -44,18 +44,26 @@ struct Player : Team {
 #define KERNEL void
 static const Fixed FIXED MODEL_INIT;
 struct Player : Team {
-  int next(int* counter) const { return (*counter)++; }
+  int next(int* counter) const { return __atomic_fetch_add(counter, 1, __ATOMIC_RELAXED); }
   bool some(bool flag) const { return flag; }
   void attend(int) const {}
   void add(int* sum, int x) const { *sum += x; }
   int stride() const { return 1; }
   int first() const { return 0; }
 };
-#define OWN_PLACE               \
-  static State s;               \
-  static Contact far[FAR + 1];  \
-  s.far = far;                  \
-  const Player t;               \
+// Memory of one thread, until its block ends.
+template <class T> struct Room {
+  T* item;
+  explicit Room(size_t count)
+      : item(static_cast<T*>(aligned_alloc(64, (count * sizeof(T) + 63) / 64 * 64))) {}
+  ~Room() { free(item); }
+};
+#define OWN_PLACE                        \
+  const Room<State> state_room(1);       \
+  const Room<Contact> far_room(FAR + 1); \
+  State& s = *state_room.item;           \
+  s.far = far_room.item;                 \
+  const Player t;                        \
   const int lane = 0;           \
   const Model& M = model_of(FIXED, s, lane);
 #endif

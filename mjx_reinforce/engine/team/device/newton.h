@@ -56,6 +56,7 @@ DEV void begin_step(const Team& t, const Model& M, State& s, Search& search, boo
 }
 // M's rows; beyond the lanes' first columns from below the diagonal, the only place of M.
 DEV void load_rows(const Team& t, const State& s, Rows& h) {
+  if (VECTORS) return load_rows_in_vectors(s, h);
   const real* flat = &s.rows[0][0].x[0];
   UNROLL for (int q = 0; q < SIDE; q += 4)
     UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
@@ -83,6 +84,7 @@ DEV void add_rows(const Team& t, const Model& M, State& s, Rows& h, real (&gradi
   int turn = 0;
   all_contacts(t, s, [&](const Contact& c) {
     if (c.stiffness[0] == 0) return;
+    if (VECTORS) return add_contact_in_vectors(M, s, c, h, gradient);
     Quad(*const rows)[quads(SIDE + 1)] = s.columns[turn];
     turn ^= 1;
     real entries[ROWS_A_LANE][CD];
@@ -146,11 +148,18 @@ DEV void load_right_side(const Team& t, State& s, const Search& search, Rows& h)
   UNROLL for (int r = 0; r < ROWS_A_LANE - 1; r++) h[r][SIDE] = right_side[t.lane + r * W];
 }
 
+// Newton's step, also in s.direction.
+DEV void find_direction(const Team& t, State& s, Search& search, Rows& h) {
+  if (VECTORS) return solve_in_vectors(s, h, search.gradient, search.direction);
+  load_right_side(t, s, search, h);
+  solve(t, s, h, search.direction);
+}
+
 // How the residuals change along s.direction. Of contacts by the velocities that the direction
 // gives to links, which is less work than by the entries of J.
 DEV void change_along(const Team& t, const Model& M, State& s) {
   const int lane = t.lane;
-  EACH(k, 6) along_tree(&s.cdof[0][0].x[0] + k, s.direction, &s.motion[0][k], 6);
+  along_tree_of(t, &s.cdof[0][0].x[0], s.direction, s.motion[0]);
   t.sync();
   each_contact(t, s, [&](Contact& c) { relative(M, s.motion, c, c.change); });
   EACH(e, NE) {
@@ -200,6 +209,7 @@ DEV Line line_search(const Team& t, const Model& M, State& s, const Search& sear
 // M times s.direction: below the diagonal of s.rows is M.
 DEV void inertia_times_direction(const Team& t, const State& s, const Search& search,
                                  real (&out)[ROWS_A_LANE]) {
+  if (VECTORS) return inertia_times_in_vectors(s, search.diagonal, search.direction, out);
   const real* flat = &s.rows[0][0].x[0];
   UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
     const int i = t.lane + r * W, row = i < NV ? i : 0;
@@ -254,8 +264,7 @@ DEV int newton(const Team& t, const Model& M, State& s) {
     load_rows(t, s, h);
     if (!damps) add_rows(t, M, s, h, search.gradient);
     if (damps && IMPLICIT == 2 && NCABLE) damp_cables(t, M, s, search.qacc, search.gradient, h);
-    load_right_side(t, s, search, h);
-    solve(t, s, h, search.direction);
+    find_direction(t, s, search, h);
     if (damps) break;
     change_along(t, M, s);
     // A whole step that changes no row led to the optimum: the cost was quadratic on the way.

@@ -22,7 +22,8 @@ constexpr int SIDE = NV + NV % 2;
 constexpr int ROWS_A_LANE = (SIDE + W) / W;
 // H and, as its row SIDE, the right side: h[r] is row lane + r W. As H is symmetric, entries before
 // column r W are not used: they are those of rows before, which have the right side as column SIDE.
-typedef real Rows[ROWS_A_LANE][SIDE + (ROWS_A_LANE > 1)];
+constexpr int ROW_SIZE = VECTORS ? (SIDE + 7) / 8 * 8 : SIDE + (ROWS_A_LANE > 1);
+typedef real Rows[ROWS_A_LANE][ROW_SIZE];
 DEV constexpr bool uses_column(int r, int j) {
   return j >= r * W && j < SIDE + (r < ROWS_A_LANE - 1);
 }
