@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import mjx_reinforce as mr
-from mjx_reinforce.engine.play import cxx
-from mjx_reinforce.engine.play import choice
+from mjx_reinforce.engine.play import choice, cxx
 from mjx_reinforce.envs.base import MujocoEnv
 
 pytestmark = pytest.mark.skipif(cxx.compiler() is None, reason="there is no C++ compiler")
