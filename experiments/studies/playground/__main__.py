@@ -89,6 +89,7 @@ def write(data: Path, page: Path) -> None:
     made = {
         "returns": partial(tables.returns, data),
         "agreement": partial(tables.agreement, data),
+        "speeds": partial(tables.speeds, data),
     }
     page.write_text(filled(page.read_text("utf-8"), made), encoding="utf-8")
 

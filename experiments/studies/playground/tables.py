@@ -9,11 +9,15 @@ import numpy as np
 
 from experiments.kit.markdown import fixed, table
 from experiments.kit.rows import read
+from experiments.speed.benchmark import rows as benchmark_rows
 from experiments.studies.playground.runs import TASKS
 from experiments.studies.results.tables import compare, estimate, number
 from mjx_reinforce.statistics import estimate_mean
 
 RETURNS, AGREEMENT, PUBLISHED = "returns.csv", "agreement.csv", "published.csv"
+#: Rows of ``experiments.speed.benchmark gpu --tasks playground:...``.
+SPEEDS = "speeds.csv"
+_RIVALS = ("Playground, MJX", "Playground, MJX-Warp")
 
 
 class Result(NamedTuple):
@@ -98,6 +102,32 @@ def returns(data: Path) -> str:
 
 def _cell(mean: float | None) -> str:
     return "" if mean is None else fixed(mean, 0)
+
+
+def speeds(data: Path) -> str:
+    """Returns the table of env steps/s beside Playground's own, the least ratio first.
+
+    Each is the best of the numbers of worlds that were tried.
+    """
+    best: dict[str, dict[str, float]] = {}
+    for row in benchmark_rows.read(data / SPEEDS):
+        name = row["engine"]
+        if name == "native":
+            name = "make_vec" if row["what"].startswith("env steps") else "rollout"
+        of_task = best.setdefault(row["task"].removeprefix("playground:"), {})
+        of_task[name] = max(of_task.get(name, 0.0), benchmark_rows.speed(row))
+
+    def ratio(of_task: dict[str, float], ours: str = "make_vec") -> float:
+        return of_task[ours] / max(of_task.get(name, 0.0) for name in _RIVALS)
+
+    lines = []
+    for task, of_task in sorted(best.items(), key=lambda item: ratio(item[1])):
+        names = ("rollout", "make_vec", *_RIVALS)
+        cells = [f"{of_task[name]:.2e}".replace("e+0", "e") for name in names]
+        ratios = (ratio(of_task), ratio(of_task, "rollout"))
+        lines.append([task, *cells, *(f"{x:.1f}" for x in ratios)])
+    header = ["task", "ours, rollout", "ours, `make_vec`", *_RIVALS]
+    return table([*header, "`make_vec` / the better", "rollout / the better"], lines)
 
 
 def agreement(data: Path) -> str:
