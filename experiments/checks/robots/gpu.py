@@ -153,28 +153,34 @@ def _why(cause: str) -> str:
 
 
 def robots(raw_rows: Sequence[Mapping[str, str]]) -> str:
-    """Returns a table of Menagerie's robots: covered or why not, equality, and speeds."""
+    """Returns a table of Menagerie's robots: covered or why not, and equality."""
+    lines = []
+    for row in teams.SETS["Menagerie's robots"](raw_rows):
+        reason = "" if row["covered"] == "yes" else row["covered"]
+        lines.append([row["model"], row["nv"], reason or row["error20"], row["error20_exact"]])
+    return table(["model", "degrees of freedom", "from C MuJoCo, or why not", "tolerance 0"], lines)
+
+
+def speeds(raw_rows: Iterable[Mapping[str, str]]) -> str:
+    """Returns a table of the robots that were timed, by the ratio to Warp, the least first.
+
+    A cell is empty where an engine did not play.
+    """
 
     def ratio(row: Mapping[str, str], number: int) -> str:
         ours, warp = row[f"native_{number}"], row[f"warp_{number}"]
         return f"{float(ours) / float(warp):.1f}" if ours and warp else ""
 
-    kept_rows = teams.SETS["Menagerie's robots"](raw_rows)
-    # There are no columns of what no GPU has timed yet.
-    are_timed = any(row[name] for row in kept_rows for name in SPEEDS)
+    def by_ratio(row: Mapping[str, str]) -> float:
+        return float(ratio(row, NUMBERS[-1]) or "inf")
+
     lines = []
-    for row in kept_rows:
-        reason = "" if row["covered"] == "yes" else row["covered"]
-        line = [row["model"], row["nv"], reason or row["error20"], row["error20_exact"]]
-        if are_timed:
-            line += [f"{float(row[name]):,.0f}" if row[name] else "" for name in SPEEDS]
-            line += [ratio(row, number) for number in NUMBERS]
-        lines.append(line)
-    header = ["model", "degrees of freedom", "from C MuJoCo, or why not", "tolerance 0"]
-    if are_timed:
-        header += [f"{name}, {n:,}" for n in NUMBERS for name in ("teams", "Warp")]
-        header += [f"teams / Warp, {n:,}" for n in NUMBERS]
-    return table(header, lines)
+    for row in sorted(raw_rows, key=by_ratio):
+        if any(row[name] for name in SPEEDS):
+            figures = [f"{float(row[name]):,.0f}" if row[name] else "" for name in SPEEDS]
+            lines.append([row["model"], *figures, *(ratio(row, number) for number in NUMBERS)])
+    header = ["model", *(f"{name}, {n:,}" for n in NUMBERS for name in ("teams", "Warp"))]
+    return table([*header, *(f"teams / Warp, {n:,}" for n in NUMBERS)], lines)
 
 
 def summary(raw_rows: Sequence[Mapping[str, str]]) -> str:

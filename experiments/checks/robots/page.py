@@ -163,6 +163,7 @@ def page(text: str, models: Sequence[Mapping[str, Any]]) -> str:
     tables = {name: lambda maker=maker: maker(models) for name, maker in makers.items()}
     of_gpu = rows.read(GPU_CSV)
     tables |= {"gpu": lambda: gpu.summary(of_gpu), "gpu_robots": lambda: gpu.robots(of_gpu)}
+    tables["gpu_speeds"] = lambda: gpu.speeds(of_gpu)
     return filled(text, tables)
 
 
