@@ -93,8 +93,9 @@ def test_the_tables_of_both_pages(folder):
     (docs / "films").mkdir(parents=True)
     (docs / "films" / "Hopper-v5-best.gif").touch()
     (docs / "published.csv").write_text(
-        "algorithm,implementation,task,mean,env_steps\n"
-        "PPO,A,Hopper,10,1000000\nPPO (asynchronous),B,Hopper,12,3000000\nSAC,C,Ant,1,1\n"
+        "algorithm,policy,implementation,task,mean,env_steps\n"
+        "PPO,on-policy,A,Hopper,10,1000000\nPPO (asynchronous),on-policy,B,Hopper,12,3000000\n"
+        "SAC,off-policy,C,Ant,1,1\nXQC (2 updates),off-policy,C,Ant,3,2\n"
     )
     (docs / "peers.csv").write_text(
         "task,peer,machine,budget_seconds,mean_return\n"
@@ -124,8 +125,8 @@ def test_the_tables_of_both_pages(folder):
     ):
         assert line in page
     assert "Reacher" not in page
-    assert "| Hopper-v5 | 6.0 | 6.0 | 16.0 in 90.0 s | 12.0 |\n" in readme
-    assert "| Ant-v5 |  |  |  |  |\n" in readme
+    assert "| Hopper-v5 | 6.0 | 6.0 | 16.0 in 90.0 s | 12.0 |  |\n" in readme
+    assert "| Ant-v5 |  |  |  |  | 3.0 |\n" in readme
     assert (docs / "results" / "seconds.png").exists()
     for text in (page, readme):
         assert "was here" not in text

@@ -246,17 +246,27 @@ def peers(path: Path) -> dict[tuple[str, str, str], dict[float, list[float]]]:
 
 
 class Figure(NamedTuple):
-    """A published figure: a mean return, and with how many env steps it was reached."""
+    """A published figure: who reached which mean return, and with how many env steps."""
 
+    algorithm: str
     mean: float
     env_steps: float
 
 
-def published(path: Path, task: str, algorithm: str) -> Figure | None:
-    """Returns the best mean of "PPO" or "SAC" in published.csv, whatever the task's version."""
+def published(path: Path, task: str, method: str) -> Figure | None:
+    """Returns the best mean in published.csv, whatever the task's version.
+
+    Args:
+      path: published.csv.
+      task: an environment id.
+      method: an algorithm, such as "PPO", whose variants count, too; or the policies of many:
+        "off-policy".
+    """
     name = task.rpartition("-")[0]
-    rows = [x for x in _read(path) if x["task"] == name and x["algorithm"].startswith(algorithm)]
+    rows = [x for x in _read(path) if x["task"] == name]
+    rows = [x for x in rows if x["policy"] == method or x["algorithm"].startswith(method)]
     if not rows:
         return None
     best = max(rows, key=lambda row: float(row["mean"]))
-    return Figure(float(best["mean"]), float(best["env_steps"]))
+    algorithm = best["algorithm"].partition(" (")[0]
+    return Figure(algorithm, float(best["mean"]), float(best["env_steps"]))

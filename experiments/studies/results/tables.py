@@ -106,14 +106,15 @@ def gpu(groups: Sequence[Group], docs: Path) -> str:
             *map(number, (group.final.min(), group.final.max())),
             seconds(group.seconds) + _stopped(group),
             _steps_of(group.env_steps),
-            *(_published(docs, group.task, algorithm) for algorithm in ("PPO", "SAC")),
+            _published(docs, group.task, "PPO"),
+            _published(docs, group.task, "off-policy"),
         ]
         for group in groups
         if group.is_gpu
     ]
     header = ["task", "on", "seeds", "after a minute: mean, worst", "at the end: mean (95%)"]
     header += ["worst", "best seed", "seconds, all seeds", "env steps per seed", "PPO, published"]
-    return table([*header, "SAC, published"], rows)
+    return table([*header, "off-policy, published"], rows)
 
 
 def _steps_of(env_steps: float) -> str:
@@ -126,11 +127,13 @@ def _short(device: str) -> str:
     return device.removeprefix("NVIDIA ").split()[0]
 
 
-def _published(docs: Path, task: str, algorithm: str) -> str:
-    figure = kept.published(docs / "published.csv", task, algorithm)
+def _published(docs: Path, task: str, method: str) -> str:
+    """Returns a published figure, with its algorithm where the method has many."""
+    figure = kept.published(docs / "published.csv", task, method)
     if figure is None:
         return "none"
-    return f"{number(figure.mean)} ({_steps_of(figure.env_steps)})"
+    name = "" if method == "PPO" else f"{figure.algorithm}, "
+    return f"{number(figure.mean)} ({name}{_steps_of(figure.env_steps)})"
 
 
 def cpu(groups: Sequence[Group], docs: Path) -> str:
@@ -205,15 +208,16 @@ def readme(groups: Sequence[Group], docs: Path) -> str:
         mine = [group for group in groups if group.task == task]
         on_gpu = [group for group in mine if group.is_gpu]
         on_cpu = sorted((x for x in mine if not x.is_gpu), key=lambda x: len(x.final))
-        cells = [_round(np.median(on_cpu[-1].minute)) if on_cpu else "", "", "", ""]
+        cells = [_round(np.median(on_cpu[-1].minute)) if on_cpu else "", "", "", "", ""]
         if on_gpu:
             cells[1] = _round(on_gpu[0].minute.mean())
             cells[2] = f"{_round(on_gpu[0].final.mean())} in {seconds(on_gpu[0].seconds)}"
-        if figure := kept.published(docs / "published.csv", task, "PPO"):
-            cells[3] = _round(figure.mean)
+        for place, method in enumerate(("PPO", "off-policy"), start=3):
+            if figure := kept.published(docs / "published.csv", task, method):
+                cells[place] = _round(figure.mean)
         rows.append([task, *cells])
-    header = ["task", "two cores, a minute", "one GPU, a minute", "one GPU, at the end", "PPO"]
-    return table(header, rows)
+    header = ["task", "two cores, a minute", "one GPU, a minute", "one GPU, at the end"]
+    return table([*header, "PPO", "off-policy"], rows)
 
 
 def _round(x: np.floating | float) -> str:
