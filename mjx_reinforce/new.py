@@ -3,7 +3,7 @@
 import dataclasses
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
@@ -71,7 +71,7 @@ def write_class(settings: NewSettings) -> None:
     template = legged if is_legged else model_class
     write_bytes(output, template.class_source(model, xml.name, module).encode())
     print(contact_counts(model))
-    print("machine code will play it" if in_c is None else f"C MuJoCo will play it: {in_c}")
+    print(_player(model, in_c))
     if (warning := instability(model)) is not None:
         print(warning)
     if not settings.fix:
@@ -87,6 +87,19 @@ def write_class(settings: NewSettings) -> None:
         preset, budget = " legged", " --minutes 20"
     print(f"{output}: {advice}, then, in its folder:")
     print(f"  python -m mjx_reinforce.train{preset} --env {task}{budget} --output {module}_run")
+
+
+def _player(model: Any, in_c: str | None) -> str:
+    """Returns what plays a model on this CPU; ``in_c`` is of ``refusals.best_in_c``."""
+    from mjx_reinforce.engine.play import cxx
+    from mjx_reinforce.engine.team import supported
+
+    if in_c is None:
+        return "machine code will play it"
+    compiler = cxx.compiler() if supported.why(model) is None else None
+    if compiler is not None:
+        return f"machine code by {compiler} will play it, and C MuJoCo where there is none: {in_c}"
+    return f"C MuJoCo will play it: {in_c}"
 
 
 def _path(xml: Path) -> str:

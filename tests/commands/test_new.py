@@ -16,6 +16,7 @@ from places import ROOT
 import mjx_reinforce as mr
 from mjx_reinforce import envs
 from mjx_reinforce.engine import choose
+from mjx_reinforce.engine.play import cxx
 from mjx_reinforce.envs.refusals import best_in_c
 
 EXAMPLES = ROOT / "experiments" / "examples"
@@ -197,6 +198,20 @@ def test_a_model_that_mjx_refuses_is_played_by_c_mujoco(tmp_path, monkeypatch, c
     env = envs.make("pgs:Pgs")
     assert choose("auto", env).name == "mujoco"
     assert np.isfinite(env.step(env.reset(jax.random.key(0)), jnp.zeros(3)).reward)
+
+
+@pytest.mark.parametrize("compiler", [None, "/usr/bin/c++"])
+def test_a_compiler_of_this_system_may_play_a_model(compiler, tmp_path, monkeypatch, capsys):
+    arm = (EXAMPLES / "my_arm.xml").read_text()
+    (tmp_path / "cones.xml").write_text(arm.replace("<option", '<option cone="elliptic"'))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cxx, "compiler", lambda: compiler)
+    write(monkeypatch, "cones.xml")
+    said = capsys.readouterr().out
+    if compiler is None:
+        assert "C MuJoCo will play it: " in said
+    else:
+        assert f"machine code by {compiler} will play it, and C MuJoCo where there is none" in said
 
 
 def test_an_unstable_model_is_named(tmp_path, monkeypatch, capsys):

@@ -148,7 +148,7 @@ def test_speeds_of_a_gpu_are_beside_what_teams_cover(tmp_path, monkeypatch):
     assert "| slow/scene.xml | 600,000 | 100,000 | 600,000 | 100,000 | 6.0 | 6.0 |" in speeds
     assert "refused" not in "".join(speeds)
     summary = gpu.summary(rows.read(tmp_path / "page.csv"))
-    assert "| Menagerie's robots | 3 | 2 | 6.0 |" in summary
+    assert "| Menagerie's robots | 3 | 2 | 6.0 of 2 |" in summary
     gpu.write(tmp_path / "page.csv", tmp_path / "teams.csv", tmp_path / "nothing.csv", tmp_path)
     untimed = rows.read(tmp_path / "page.csv")
     assert "| slow/scene.xml | 1 | 1e-12 |  |" in gpu.robots(untimed).splitlines()

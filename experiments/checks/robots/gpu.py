@@ -194,10 +194,12 @@ def summary(raw_rows: Sequence[Mapping[str, str]]) -> str:
             for n in NUMBERS[-1:]
             if row[f"native_{n}"] and row[f"warp_{n}"]
         ]
-        middle = f"{statistics.median(ratios):.1f}" if ratios else "not timed"
+        middle = f"{statistics.median(ratios):.1f} of {len(ratios)}" if ratios else "not timed"
         num_covered = sum(row["covered"] == "yes" for row in kept)
         lines.append([name, str(len(kept)), str(num_covered), middle])
-    return table(["set", "robots", "covered by teams", "median speed / Warp's"], lines)
+    return table(
+        ["set", "robots", "covered by teams", "median speed / Warp's of those timed"], lines
+    )
 
 
 def write(path: Path, team_rows: Path, timed: Path, folder: Path) -> None:
