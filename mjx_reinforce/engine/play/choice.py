@@ -109,6 +109,8 @@ def choose(
         in_c = instead_of_vmap(env, reason)
         if in_c is not None:
             return engine_in_c(*in_c)
+    if engine_name == "vmap":
+        _warn_of_wrong_products()
     if engine_name == "native" and available.platform() == "gpu":
         reason += f", {team.played_by(env)}"
     elif engine_name == "native" and program.has_one_lane(env):
@@ -203,14 +205,18 @@ def pick(
         if name == "native":
             raise ValueError(f"the native engine cannot play this: {function}; choose auto")
         reason = f"machine code cannot play this: {function}"
+    return "vmap", reason, vmap_function
+
+
+def _warn_of_wrong_products() -> None:
+    """Warns, where ``vmap`` plays, of a JAX that computes some products wrongly."""
     if (jax.default_backend(), jax.__version__) == ("cpu", _WRONG_JAX):
         warnings.warn(
             f"JAX {_WRONG_JAX} computes some products of many rows wrongly on CPUs, and the engine "
             "is vmap, which leaves all to it; with Python 3.12 or newer take a newer JAX "
             "(docs/troubleshooting.md)",
-            stacklevel=2,
+            stacklevel=3,
         )
-    return "vmap", reason, vmap_function
 
 
 def _from_any_key(
@@ -274,7 +280,10 @@ def map_function(
       ValueError: the name is unknown, or the engine does not support the function.
     """
     native_maker = functools.partial(machine_code, env, function, *examples)
-    return MapEngine(*pick(name, native_maker, jax.vmap(function)))
+    engine = MapEngine(*pick(name, native_maker, jax.vmap(function)))
+    if engine.name == "vmap":
+        _warn_of_wrong_products()
+    return engine
 
 
 def machine_code(
