@@ -21,7 +21,7 @@ from mjx_reinforce.engine import base
 from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory
 from mjx_reinforce.engine.checks import check_count, check_key, check_name, check_parts
 from mjx_reinforce.engine.contract import check_policy
-from mjx_reinforce.engine.play import available, c_mujoco, native, program, rollouts
+from mjx_reinforce.engine.play import available, c_mujoco, cxx, native, program, rollouts
 from mjx_reinforce.engine.play import teams as team
 
 #: This JAX multiplies wrongly on CPUs, in some functions that are mapped over some 16,000 rows and
@@ -138,7 +138,11 @@ def _in_c_mujoco(name: str, env: Environment) -> tuple[Environment, str] | None:
     """
     refusal = getattr(c_mujoco.innermost(env), "refusal", None)
     if refusal is not None and name in ("vmap", "native"):
-        raise ValueError(f"the {name} engine cannot play this: {refusal}; choose auto")
+        remedy = "choose auto"
+        # The device code may play it, which is compiled here.
+        if name == "native" and available.platform() == "cpu" and cxx.compiler() is None:
+            remedy += ", or install a C++ compiler if the run was played with one"
+        raise ValueError(f"the {name} engine cannot play this: {refusal}; {remedy}")
     reason = c_mujoco.why_best(env)
     if name != "mujoco" and (name != "auto" or reason is None):
         return None

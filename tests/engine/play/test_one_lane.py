@@ -96,6 +96,8 @@ def test_an_episode_depends_on_nothing_else():
 def test_without_a_compiler_c_plays(monkeypatch):
     monkeypatch.setattr(cxx, "compiler", lambda: None)
     assert _episodes("auto", Sled())[0].name == "mujoco"
+    with pytest.raises(ValueError, match=r"install a C\+\+ compiler"):
+        _episodes("native", Sled())
 
 
 #: Programs that are called c++ and are none, or none that makes kernels.
