@@ -39,7 +39,7 @@ def check_room(num_bytes: float) -> None:
     if num_bytes > memory:
         raise ValueError(
             f"this does not fit into memory: it needs about {gigabytes(num_bytes)}, "
-            f"{gigabytes(memory)} are here; lower --num-seeds (of a sweep --chunk-runs), "
+            f"{gigabytes(memory)} are here; lower --num-seeds (of a sweep --chunk-runs), --race, "
             "--num-episodes, --eval-episodes, --hidden-sizes, --value-hidden-sizes or --horizon"
         )
 

@@ -261,7 +261,7 @@ def _train(name: str, interrupt: Interrupt) -> int:
 
 
 def _refuse_full(error: RuntimeError | MemoryError | OSError, design: Design) -> NoReturn:
-    """Refuses what met a full memory or disk, as ``refuse``; raises any other error again.
+    """Refuses what met a full memory or disk, also in a compiler; raises any other error again.
 
     So is refused a directory that is no longer there.
     """
@@ -276,6 +276,8 @@ def _refuse_full(error: RuntimeError | MemoryError | OSError, design: Design) ->
         room_advice = "make room, then" if error.errno else "then"
         file_owner = f"the files of this {design.kind}"
         refuse(f"cannot write {file_owner} ({error}); {room_advice} {remedy}", status=1)
+    if "machine code of a step was not compiled" in str(error):  # the words of cpu/waiting.ll
+        refuse(str(error), status=1)
     # JAX reports a full device as a RuntimeError with this status in its text.
     if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
         raise error

@@ -24,6 +24,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
+from mjx_reinforce.engine.cpu import emit
 from mjx_reinforce.files import check_place
 from mjx_reinforce.runs.design import Design, check_design
 from mjx_reinforce.settings.config import code_flags
@@ -135,6 +136,7 @@ def own_directory(
             ) from error
         # A signal that ends the process runs no ``finally``.
         interrupt.on_exit(lambda: remove_empty(new_folders))
+        interrupt.on_exit(lambda: emit.end_processes(seconds=1))
         try:
             yield directory_stat
         finally:

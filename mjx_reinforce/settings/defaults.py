@@ -18,7 +18,7 @@ from typing import Any
 
 from mjx_reinforce.engine.checks import whole_number
 from mjx_reinforce.engine.memory import num_cores  # noqa: F401 (its users find it here)
-from mjx_reinforce.settings.config import CODE, Config, spoken
+from mjx_reinforce.settings.config import CODE, MAX_COUNT, Config, spoken
 
 
 def read_tables(name: str) -> dict[str, dict[str, Any]]:
@@ -145,7 +145,8 @@ def of_task(
         minute_steps = base.env_steps or 0
     budget = env_steps
     if budget is None:
-        budget = max(1, round(minute_steps * (1 if minutes is None else minutes)))
+        steps = round(minute_steps * (1 if minutes is None else minutes))
+        budget = min(max(1, steps), MAX_COUNT)
     for min_steps, settings in OF_BUDGETS.get(env, ()):
         # On a GPU few episodes take as long as many.
         if budget >= min_steps or (env_steps is None and has_gpu()):

@@ -57,8 +57,11 @@ def env_steps_in(
     moments = [_Moment.of(0.0, slots)]
     # Calls of 1, 2, 4, ... updates: nobody knows yet how long one takes, and so the last call is
     # about half of the trial. The first call does not count as a trial: on a GPU it loads programs.
+    # Where it took all of the time, another would only be late.
     trial = 0.0
-    while trial < _TRIAL_SHARE * seconds and not (moments[1:] and interrupted()):
+    while trial < _TRIAL_SHARE * seconds and moments[-1].seconds < seconds:
+        if moments[1:] and interrupted():
+            break
         num_updates = 2 ** (len(moments) - 1)
         slots.budget = Budget.of(None, min(moments[-1].updates + num_updates, max_updates))
         if not slots.advance(evaluate=False):

@@ -193,6 +193,17 @@ def test_what_is_trained_in_a_time(monkeypatch, seconds, machine, config, expect
     assert minutes.env_steps_in(seconds, machine, config) == expected
 
 
+def test_a_trial_ends_where_its_first_update_took_all_of_the_time(monkeypatch):
+    machine = Machine(itertools.repeat(50), once=60.0)
+    monkeypatch.setattr(minutes.time, "perf_counter", lambda: machine.now)
+    assert minutes.env_steps_in(12.0, machine, Config()) == 1
+    assert machine.updates == 1
+
+
+def test_minutes_beyond_all_counts_have_settings():
+    assert of_task("CartPole-v1", minutes=1e200).env_steps == MAX_COUNT
+
+
 @pytest.mark.parametrize(
     ("speed_at", "first_budget"),
     [

@@ -1,14 +1,17 @@
-"""LLVM's compiler: from text to object code, here or in a process of its own.
+"""Compilers: LLVM's, from text to object code, here or in a process of its own, and others'.
 
 llvmlite lets one thread at a time into LLVM. So a long text is compiled by this file, run as a
 program with the name of a machine: it reads the text, and writes object code.
 """
 
 import atexit
+import contextlib
+import os
+import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, TypeVar
 
@@ -49,26 +52,41 @@ def elsewhere(text: str, triple: str, cpu: str, features: str, effort: int) -> b
     """
     # With -P this file's folder is not the first in which Python looks for modules.
     command = [sys.executable, "-P", __file__, triple, cpu, features, str(effort)]
+    try:
+        done = run(command, text.encode())
+    except OSError:  # such as no memory, or no Python there any more
+        return None
+    if done.returncode < 0:
+        raise RuntimeError(f"LLVM was stopped by signal {-done.returncode}")
+    if done.returncode:
+        return None
+    return done.stdout
+
+
+def run(command: Sequence[str], data: bytes = b"") -> subprocess.CompletedProcess[bytes]:
+    """Runs a compiler in a process that ends with this one.
+
+    Args:
+      command: the program and its arguments.
+      data: what it reads from standard input.
+
+    Raises:
+      OSError: it cannot start.
+      RuntimeError: this process ends.
+    """
     pipe = subprocess.PIPE
     with _START_LOCK:
         if _EXIT_EVENT.is_set():
             raise RuntimeError("this process ends")
         # In a session of its own: Ctrl-C asks a run to stop, which still needs its code for that.
-        try:
-            process = subprocess.Popen(
-                command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, start_new_session=True
-            )
-        except OSError:  # such as no memory, or no Python there any more
-            return None
+        process = subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, stderr=pipe, start_new_session=True
+        )
         _PROCESSES.append(process)
     # Outside of the lock, which is held for a moment: this waits for minutes.
-    data, _ = process.communicate(text.encode())
+    stdout, stderr = process.communicate(data)
     _PROCESSES.remove(process)
-    if process.returncode < 0:
-        raise RuntimeError(f"LLVM was stopped by signal {-process.returncode}")
-    if process.returncode:
-        return None
-    return data
+    return subprocess.CompletedProcess(command, process.returncode, stdout, stderr)
 
 
 def later(task: Callable[[], Result]) -> Future[Result]:
@@ -88,15 +106,28 @@ def later(task: Callable[[], Result]) -> Future[Result]:
 
 
 @atexit.register
-def end_processes() -> None:
-    """Ends LLVM's processes when this one ends; no other starts any more."""
+def end_processes(seconds: float | None = None) -> None:
+    """Ends the compilers' processes when this one ends; no other starts any more.
+
+    Args:
+      seconds: for which the threads that wait for them may take; by default what they take.
+    """
     with _START_LOCK:
         _EXIT_EVENT.set()
         for process in _PROCESSES:
-            process.kill()
+            _end(process)
     # Their processes are gone, so they return at once; none is left in LLVM while Python ends.
     for thread in _THREADS:
-        thread.join()
+        thread.join(seconds)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Ends a process and those that it has started, as a driver of compilers does."""
+    if sys.platform == "win32":
+        process.kill()
+        return
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
 
 
 def main() -> None:

@@ -45,8 +45,9 @@ def register(code: Code) -> None:
         return
     jax.devices()  # a handler refused before XLA has started would keep it from starting
     # XLA keeps the first address that it gets; of code that is still compiled that of a handler
-    # which waits for it.
-    is_compiled = code.future_addresses.done()
+    # which waits for it, and says where it was not compiled.
+    future = code.future_addresses
+    is_compiled = future.done() and not future.exception()
     address = code.addresses["handler"] if is_compiled else _waiting_handler(code)
     capsule = jax.ffi.pycapsule(ctypes.c_void_p(address))
     jax.ffi.register_ffi_target(_target(code.key), capsule, platform="cpu")

@@ -1,6 +1,6 @@
 ; Calls a handler that may still be compiled: @slot points to it once it is in memory.
 @slot = global ptr null
-@words = internal constant [102 x i8] c"LLVM did not compile the machine code of a step, perhaps for lack of memory; --engine vmap needs none\00"
+@words = internal constant [108 x i8] c"the machine code of a step was not compiled, perhaps for lack of memory; --engine mujoco or vmap needs none\00"
 declare i32 @usleep(i32)
 
 define internal ptr @execute(ptr %frame) {

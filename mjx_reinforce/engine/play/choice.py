@@ -21,7 +21,7 @@ from mjx_reinforce.engine import base
 from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory
 from mjx_reinforce.engine.checks import check_count, check_key, check_name, check_parts
 from mjx_reinforce.engine.contract import check_policy
-from mjx_reinforce.engine.play import available, c_mujoco, native, program, rollouts
+from mjx_reinforce.engine.play import available, c_mujoco, cxx, native, program, rollouts
 from mjx_reinforce.engine.play import teams as team
 
 #: This JAX multiplies wrongly on CPUs, in some functions that are mapped over some 16,000 rows and
@@ -109,6 +109,8 @@ def choose(
         in_c = instead_of_vmap(env, reason)
         if in_c is not None:
             return engine_in_c(*in_c)
+    if engine_name == "vmap":
+        _warn_of_wrong_products()
     if engine_name == "native" and available.platform() == "gpu":
         reason += f", {team.played_by(env)}"
     elif engine_name == "native" and program.has_one_lane(env):
@@ -136,7 +138,11 @@ def _in_c_mujoco(name: str, env: Environment) -> tuple[Environment, str] | None:
     """
     refusal = getattr(c_mujoco.innermost(env), "refusal", None)
     if refusal is not None and name in ("vmap", "native"):
-        raise ValueError(f"the {name} engine cannot play this: {refusal}; choose auto")
+        remedy = "choose auto"
+        # The device code may play it, which is compiled here.
+        if name == "native" and available.platform() == "cpu" and cxx.compiler() is None:
+            remedy += ", or install a C++ compiler if the run was played with one"
+        raise ValueError(f"the {name} engine cannot play this: {refusal}; {remedy}")
     reason = c_mujoco.why_best(env)
     if name != "mujoco" and (name != "auto" or reason is None):
         return None
@@ -203,14 +209,18 @@ def pick(
         if name == "native":
             raise ValueError(f"the native engine cannot play this: {function}; choose auto")
         reason = f"machine code cannot play this: {function}"
+    return "vmap", reason, vmap_function
+
+
+def _warn_of_wrong_products() -> None:
+    """Warns, where ``vmap`` plays, of a JAX that computes some products wrongly."""
     if (jax.default_backend(), jax.__version__) == ("cpu", _WRONG_JAX):
         warnings.warn(
             f"JAX {_WRONG_JAX} computes some products of many rows wrongly on CPUs, and the engine "
             "is vmap, which leaves all to it; with Python 3.12 or newer take a newer JAX "
             "(docs/troubleshooting.md)",
-            stacklevel=2,
+            stacklevel=3,
         )
-    return "vmap", reason, vmap_function
 
 
 def _from_any_key(
@@ -274,7 +284,10 @@ def map_function(
       ValueError: the name is unknown, or the engine does not support the function.
     """
     native_maker = functools.partial(machine_code, env, function, *examples)
-    return MapEngine(*pick(name, native_maker, jax.vmap(function)))
+    engine = MapEngine(*pick(name, native_maker, jax.vmap(function)))
+    if engine.name == "vmap":
+        _warn_of_wrong_products()
+    return engine
 
 
 def machine_code(

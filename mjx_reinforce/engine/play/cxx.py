@@ -7,7 +7,6 @@ become one, which is kept and linked as any other.
 import functools
 import os
 import shutil
-import subprocess
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 from mjx_reinforce.engine.cpu import emit, handler, kernel, machine
 from mjx_reinforce.engine.gpu.loops import RESULTS
 from mjx_reinforce.engine.gpu.source import Source
-from mjx_reinforce.engine.scalar import scalarized
+from mjx_reinforce.engine.scalar import UnsupportedPrimitive, scalarized
 
 #: No function sets errno, and nothing unwinds the stack.
 _OPTIONS = ("-std=c++17", "-O3", "-fPIC", "-w", "-fno-math-errno", "-fno-trapping-math")
@@ -40,8 +39,9 @@ def compiler() -> str | None:
         if path is not None:
             try:
                 with tempfile.TemporaryDirectory() as folder:
-                    _object(path, 'extern "C" int one() { return 1; }', Path(folder))
-            except RuntimeError:
+                    example = _object(path, 'extern "C" int one() { return 1; }', Path(folder))
+                    _join(path, [example], Path(folder))
+            except (OSError, UnsupportedPrimitive):
                 continue
             return path
     return None
@@ -50,8 +50,7 @@ def compiler() -> str | None:
 @functools.cache
 def version() -> str:
     """Returns what the compiler says that it is."""
-    command = [str(compiler()), "--version"]
-    return subprocess.run(command, capture_output=True, text=True, check=False).stdout
+    return emit.run([str(compiler()), "--version"]).stdout.decode(errors="replace")
 
 
 def player_text(program: scalarized.Scalarized, source: Source) -> str:
@@ -133,11 +132,22 @@ define void @work(ptr %job) {
 """
 
 
+def check(text: str) -> None:
+    """Checks that the compiler takes a text, in a tenth of the time of compiling it.
+
+    Raises:
+      UnsupportedPrimitive: the compiler refuses it.
+    """
+    program, _, _ = text.partition(_BORDER)
+    with tempfile.TemporaryDirectory() as folder:
+        _run(str(compiler()), [*_options(), "-fsyntax-only", str(_written(program, Path(folder)))])
+
+
 def compiled(text: str, target: machine.Machine) -> bytes:
     """Returns the object of a text.
 
     Raises:
-      RuntimeError: the compiler refuses it.
+      UnsupportedPrimitive: the compiler refuses it.
     """
     program, _, entry = text.partition(_BORDER)
     path = str(compiler())
@@ -146,26 +156,42 @@ def compiled(text: str, target: machine.Machine) -> bytes:
         llvm = emit.target_machine(target.triple, target.cpu, target.features, 2)
         handler_object = Path(folder, "handler.o")
         handler_object.write_bytes(llvm.emit_object(emit.parse(entry, llvm)))
-        joint_object = Path(folder, "joint.o")
-        # A relocatable object of both, not a library: LLVM puts it into memory.
-        options = ("-r", "-nostdlib", "-o", str(joint_object))
-        _run(path, [*options, str(kernel_object), str(handler_object)])
-        return joint_object.read_bytes()
+        return _join(path, [kernel_object, handler_object], Path(folder)).read_bytes()
+
+
+def _join(path: str, parts: Sequence[Path], folder: Path) -> Path:
+    """Returns where one object of several is, in a folder."""
+    joint_object = folder / "joint.o"
+    # Relocatable, no library: LLVM puts it into memory.
+    _run(path, ["-r", "-nostdlib", "-o", str(joint_object), *map(str, parts)])
+    return joint_object
 
 
 def _object(path: str, program: str, folder: Path) -> Path:
     """Returns where the object of a C++ program is, in a folder; see ``compiled``."""
-    level = os.environ.get(machine.VARIABLE) or machine.HOST
+    place = folder / "kernel.o"
+    _run(path, [*_options(), "-c", str(_written(program, folder)), "-o", str(place)])
+    return place
+
+
+def _written(program: str, folder: Path) -> Path:
+    """Writes a C++ program into a folder; returns where."""
     source = folder / "kernel.cpp"
     source.write_text(program, "utf-8")
-    place = source.with_suffix(".o")
-    march = f"-march={'native' if level == machine.HOST else level}"
-    _run(path, [*_OPTIONS, march, "-c", str(source), "-o", str(place)])
-    return place
+    return source
+
+
+def _options() -> tuple[str, ...]:
+    """Returns the compiler's options for this machine."""
+    level = os.environ.get(machine.VARIABLE) or machine.HOST
+    return (*_OPTIONS, f"-march={'native' if level == machine.HOST else level}")
 
 
 def _run(path: str, arguments: Sequence[str]) -> None:
     """Runs a compiler."""
-    done = subprocess.run([path, *arguments], capture_output=True, text=True, check=False)
+    done = emit.run([path, *arguments])
     if done.returncode:
-        raise RuntimeError(f"{path} refuses a kernel: {done.stderr[:1000]}")
+        lines = done.stderr.decode(errors="replace").splitlines() or [f"exit {done.returncode}"]
+        # The first error, without the place in a file that is gone.
+        message = next((x for x in lines if "error: " in x), lines[0]).rpartition("error: ")[2]
+        raise UnsupportedPrimitive(f"the C++ compiler {path} refuses it: {message[:200]}")

@@ -351,9 +351,10 @@ def _by_one_lane(
 
         def write() -> str:
             expansion = _write_out(traced, shapes)
-            return writers.lane(
-                expansion, _titled(writers.team(expansion, physics), name, expansion)
-            )
+            device_kernel = _titled(writers.team(expansion, physics), name, expansion)
+            text = writers.lane(expansion, device_kernel)
+            cxx.check(text)  # here, so that another engine plays what the compiler refuses
+            return text
 
         target = machine.this_machine()
         code = machine.load_module(

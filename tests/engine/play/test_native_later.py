@@ -68,10 +68,21 @@ def test_what_is_not_compiled_is_an_error_of_the_program(slow):
     seam.register(code)
     play = jax.jit(lambda active: items.play(code, active)).lower(jnp.array(ACTIVE)).compile()
     go_on.set()
-    with pytest.raises(Exception, match=r"LLVM did not compile .* --engine vmap needs none"):
+    with pytest.raises(Exception, match=r"step was not compiled, .* vmap needs none"):
         jax.block_until_ready(play(jnp.array(ACTIVE)))
     with pytest.raises(RuntimeError, match="no memory is left"):
         _ = code.addresses
+
+
+def test_what_failed_before_xla_asks_is_an_error_of_the_program(slow):
+    go_on, errors = slow
+    errors.append(RuntimeError("no memory is left"))
+    go_on.set()
+    code = items.load()
+    assert code.future_addresses.exception(timeout=9)
+    seam.register(code)
+    with pytest.raises(Exception, match="step was not compiled"):
+        jax.block_until_ready(jax.jit(lambda active: items.play(code, active))(jnp.array(ACTIVE)))
 
 
 def test_a_text_that_is_no_ir_is_known_at_once():

@@ -1,5 +1,10 @@
 """Robots that C MuJoCo plays best, by the device code with one lane on a CPU."""
 
+import signal
+import threading
+import time
+import warnings
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -7,6 +12,7 @@ import numpy as np
 import pytest
 
 import mjx_reinforce as mr
+from mjx_reinforce.engine.cpu import emit
 from mjx_reinforce.engine.play import choice, cxx
 from mjx_reinforce.envs.base import MujocoEnv
 
@@ -90,3 +96,53 @@ def test_an_episode_depends_on_nothing_else():
 def test_without_a_compiler_c_plays(monkeypatch):
     monkeypatch.setattr(cxx, "compiler", lambda: None)
     assert _episodes("auto", Sled())[0].name == "mujoco"
+    with pytest.raises(ValueError, match=r"install a C\+\+ compiler"):
+        _episodes("native", Sled())
+
+
+#: Programs that are called c++ and are none, or none that makes kernels.
+_NO_COMPILERS = {
+    "another machine's program": b"\x7fELF",
+    "it fails, and writes no UTF-8": b"#!/bin/sh\nprintf '\\377' >&2; exit 1\n",
+}
+
+
+def _program(folder, content):
+    """Writes a program that is called c++; returns where."""
+    path = folder / "c++"
+    path.write_bytes(content)
+    path.chmod(0o755)
+    return str(path)
+
+
+@pytest.mark.parametrize("name", _NO_COMPILERS)
+def test_what_is_no_compiler_is_passed_over(name, monkeypatch, tmp_path):
+    _program(tmp_path, _NO_COMPILERS[name])
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert cxx.compiler.__wrapped__() is None
+
+
+def test_what_the_compiler_refuses_c_plays(monkeypatch, tmp_path):
+    # As a compiler that is too old: it takes its options, and not the text.
+    path = _program(tmp_path, b"#!/bin/sh\necho 'k.cpp:1:1: error: what is this?' >&2; exit 1\n")
+    monkeypatch.setattr(cxx, "compiler", lambda: path)
+    monkeypatch.setattr(cxx, "version", lambda: "too old")
+    with warnings.catch_warnings():
+        # vmap does not play, so nothing is said of what it computes.
+        warnings.filterwarnings("error", message="JAX .* computes")
+        engine, _ = _episodes("auto", Sled())
+    assert engine.name == "mujoco"
+    assert engine.why.endswith("c++ refuses it: what is this?")
+
+
+def test_a_compiler_ends_with_what_it_has_started(monkeypatch):
+    processes = []
+    monkeypatch.setattr(emit, "_PROCESSES", processes)
+    monkeypatch.setattr(emit, "_EXIT_EVENT", threading.Event())
+    # The child holds the pipes: unless it ends too, nobody would see their end for a minute.
+    later = emit.later(lambda: emit.run(["sh", "-c", "sleep 60 & wait"]))
+    while not processes:
+        time.sleep(0.01)
+    time.sleep(0.3)
+    emit.end_processes(seconds=0)
+    assert later.result(timeout=20).returncode == -signal.SIGKILL
