@@ -133,7 +133,7 @@ define void @work(ptr %job) {
 
 
 def check(text: str) -> None:
-    """Checks that the compiler takes a text, in a tenth of the time of compiling it.
+    """Checks that the compiler takes a text, before any code is made of it.
 
     Raises:
       UnsupportedPrimitive: the compiler refuses it.
