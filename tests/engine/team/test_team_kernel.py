@@ -427,9 +427,9 @@ def test_teams_play_what_c_mujoco_plays_on_a_cpu(teams, flags):
     actor, act, distribution = actor_and_act(env, (5,))
     policy = choice.ActingPolicy(act, actor, distribution)
     trajectories = []
-    for begins, name in ((list, "mujoco"), (teams, "native")):
+    for begins, asked, name in ((list, "mujoco", "mujoco"), (teams, "auto", "native")):
         made = begins()
-        engine = choice.choose("auto", env, policy, 30)
+        engine = choice.choose(asked, env, policy, 30)
         assert engine.name == name
         trajectories.append(played(engine.rollout, env, (actor, act, distribution)))
     assert {kernel.launch.lanes for kernel in made} == {16}

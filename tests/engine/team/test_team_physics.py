@@ -30,6 +30,28 @@ _OWN = str(Path(__file__).parents[3] / "experiments" / "examples" / "quadruped")
 _MODELS = tomllib.loads((Path(__file__).parent / "models.toml").read_text("utf-8"))
 _QUICK = ("limits", "condim 6 and 4", "elliptic cones, condim 1 and 3", "boxes on boxes", "3 steps")
 _VECTORS = ("limits", "elliptic cones, condim 1 and 3")
+#: Features that reach each function which one lane computes by vectors.
+_MORE_VECTORS = {
+    "features": [
+        "a ball, Runge-Kutta",
+        "a ball, implicitfast",
+        "friction loss",
+        "weld of two bodies",
+        "a tendon between two trees, implicitfast",
+        "limits and friction loss of tendons",
+        "lone free bodies, implicitfast",
+        "condim 6 and 4",
+        "elliptic cones, condim 6 and 4, impratio",
+        "more than 32 degrees of freedom",
+        "mocap bodies that touch, elliptic cones",
+        "what is convex on a mesh, elliptic cones",
+        "no slip, elliptic cones of bodies that meet, implicitfast",
+    ],
+    "early": [
+        "4 steps, elliptic cones",
+        "3 steps of trees that tendons, joints and contacts join, implicitfast",
+    ],
+}
 _OF_MOCAP = [x for x in _MODELS["features"] if "mocap" in x]
 _MANY = '<geom size=".1"/>'
 _BOX = '<geom type="box" size=".1 .1 .1"/>'
@@ -203,9 +225,12 @@ def test_a_search_that_stops_early_ends_where_c_ends(limits, tmp_path):
 @pytest.mark.parametrize(
     ("part", "feature"),
     [
-        pytest.param(part, x, marks=[] if x in _VECTORS else pytest.mark.slow)
-        for part in ("features", "early")
-        for x in _MODELS[part]
+        *(("features", x) for x in _VECTORS),
+        *(
+            pytest.param(part, x, marks=pytest.mark.slow)
+            for part, names in _MORE_VECTORS.items()
+            for x in names
+        ),
     ],
 )
 def test_one_lane_computes_in_vectors(part, feature, tmp_path):
