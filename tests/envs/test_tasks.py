@@ -4,7 +4,9 @@ Both get the same made-up simulations: numbers that no step could lead to, of ev
 """
 
 import math
+import re
 import types
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -160,6 +162,21 @@ def test_starts_are_spread_as_gymnasiums(id):
     mine, wanted = (x[:, moves] - x[:, moves].mean(axis=0) for x in (mine, wanted))
     is_normal = [abs(x).max(axis=0) > 2.4 * x.std(axis=0) for x in (mine, wanted)]
     np.testing.assert_array_equal(is_normal[0], is_normal[1])
+
+
+def test_half_cheetahs_masses_do_not_need_settotalmass():
+    """The file says by which density, for the day when MuJoCo drops what it deprecates."""
+    text = (Path(models.__file__).parent / "assets" / "half_cheetah.xml").read_text("utf-8")
+    (density,) = re.findall(r'density="[\d.]+"', text)
+    comment, _, rest = text.replace(' settotalmass="14"', "").partition("-->")
+    by_density = mujoco.MjModel.from_xml_string(rest.replace("<geom ", f"<geom {density} ", 1))
+    model = models.load_model("half_cheetah.xml")
+    assert "settotalmass" in comment
+    assert "settotalmass" not in rest
+    for name in ("body_mass", "body_inertia", "body_ipos", "body_invweight0", "dof_invweight0"):
+        pair = (getattr(by_density, name), getattr(model, name))
+        np.testing.assert_allclose(*pair, rtol=1e-14, atol=1e-16, err_msg=name)
+    assert by_density.stat.meaninertia == pytest.approx(model.stat.meaninertia, rel=1e-14)
 
 
 @pytest.mark.slow
