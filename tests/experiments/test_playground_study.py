@@ -65,8 +65,9 @@ def test_every_task_has_published_figures():
 
 
 @pytest.mark.slow
-def test_a_run_goes_on_for_more_minutes_and_is_not_repeated(tmp_path, capsys):
+def test_a_run_goes_on_for_more_minutes_and_is_not_repeated(tmp_path, monkeypatch, capsys):
     pytest.importorskip("mujoco_playground")
+    monkeypatch.setattr(runs, "TEST_EPISODES", 2)
     tasks = ["NoSuchTask", "PendulumSwingup"]
     assert not runs.train(tasks, tmp_path, num_seeds=2, minutes=0.02)
     said = capsys.readouterr().out

@@ -33,17 +33,12 @@ _VECTORS = ("limits", "elliptic cones, condim 1 and 3")
 #: Features that reach each function which one lane computes by vectors.
 _MORE_VECTORS = {
     "features": [
-        "a ball, Runge-Kutta",
         "a ball, implicitfast",
-        "friction loss",
-        "weld of two bodies",
         "a tendon between two trees, implicitfast",
         "limits and friction loss of tendons",
         "lone free bodies, implicitfast",
-        "condim 6 and 4",
         "elliptic cones, condim 6 and 4, impratio",
         "more than 32 degrees of freedom",
-        "mocap bodies that touch, elliptic cones",
         "what is convex on a mesh, elliptic cones",
         "no slip, elliptic cones of bodies that meet, implicitfast",
     ],
