@@ -46,9 +46,9 @@ def main() -> None:
     num_policies = arguments.num_seeds * arguments.race
     repeated = ["--like", str(raced), "--race", "1", "--num-seeds", str(num_policies)]
     _train(independent, [*repeated, "--env-steps", str(env_steps)])
-    found = compare(raced, independent)
-    rows.write(arguments.directory / "racing.csv", found)
-    print(table([*found[0]], [[str(x) for x in row.values()] for row in found]))
+    comparison = compare(raced, independent)
+    rows.write(arguments.directory / "racing.csv", comparison)
+    print(table([*comparison[0]], [[str(x) for x in row.values()] for row in comparison]))
 
 
 def _train(directory: Path, words: Sequence[str]) -> None:

@@ -164,10 +164,10 @@ def divide_run(config: Config) -> Division:
       config: its settings.
     """
     num_devices = jax.local_device_count()
-    num_seeds = config.num_policies
-    # Seeds a device, and from that the devices: of 5 seeds on 4 devices two each, on three.
-    seeds_per_device = -(-num_seeds // num_devices)
-    seed_division = Division(seeds=-(-num_seeds // seeds_per_device))
+    num_policies = config.num_policies
+    # Policies a device, and from that the devices: of 5 policies on 4 devices two each, on three.
+    policies_per_device = -(-num_policies // num_devices)
+    seed_division = Division(seeds=-(-num_policies // policies_per_device))
     is_cpu = jax.default_backend() == "cpu"
     if is_cpu and jax.__version__ == _DIVIDES_NO_EPISODES:
         return seed_division
@@ -180,10 +180,10 @@ def divide_run(config: Config) -> Division:
         for device_count in range(1, num_devices + 1)
         if config.num_episodes % device_count == 0
     )
-    episodes_per_device = num_seeds * config.episodes_per_update / num_episode_devices
+    episodes_per_device = num_policies * config.episodes_per_update / num_episode_devices
     has_enough_episodes = episodes_per_device >= _MIN_EPISODES or is_cpu
-    # Both sides say how many seeds' episodes a device plays, and the lower one takes less time.
-    if has_enough_episodes and num_seeds / num_episode_devices < seeds_per_device:
+    # Both sides say how many policies' episodes a device plays, and the lower one takes less time.
+    if has_enough_episodes and num_policies / num_episode_devices < policies_per_device:
         return Division(episodes=num_episode_devices)
     return seed_division
 

@@ -57,8 +57,8 @@ def compiled(task: str, batches: tuple[int, ...]) -> list[Stepping]:
         for stepping in _or_reason(_traced, task, batch, implementation)
     ]
     with concurrent.futures.ThreadPoolExecutor(4) as pool:
-        made = pool.map(lambda stepping: _or_reason(_compiled, stepping), traced)
-        return [stepping for steppings in made for stepping in steppings]
+        programs = pool.map(lambda stepping: _or_reason(_compiled, stepping), traced)
+        return [stepping for steppings in programs for stepping in steppings]
 
 
 def _or_reason(make: Callable[..., Any], *arguments: Any) -> list[Any]:
@@ -74,9 +74,9 @@ def _traced(task: str, batch: int, implementation: str | None) -> Stepping:
     """Returns the programs of ours (None), or of Playground's own."""
     if implementation is None:
         settings = "make_vec"
-        own: Any = mr.envs.make(task)
-        action_size = own.action_size
-        vec = mr.make_vec(own, num_envs=batch)
+        task_env: Any = mr.envs.make(task)
+        action_size = task_env.action_size
+        vec = mr.make_vec(task_env, num_envs=batch)
         start = vec.reset
         step = vec.step
     else:
@@ -153,7 +153,7 @@ def _lacking(states: Any) -> str:
 
 def candidates(steppings: list[Stepping]) -> list[Candidate]:
     """Returns what is timed; what fails, such as for lack of memory, is left out."""
-    return [made for stepping in steppings for made in _or_reason(_candidate, stepping)]
+    return [x for stepping in steppings for x in _or_reason(_candidate, stepping)]
 
 
 def _candidate(stepping: Stepping) -> Candidate:

@@ -86,12 +86,12 @@ def write(data: Path, page: Path) -> None:
     """Writes the tables of the page again, between their marks."""
     from experiments.studies.playground import tables
 
-    made = {
+    texts = {
         "returns": partial(tables.returns, data),
         "agreement": partial(tables.agreement, data),
         "speeds": partial(tables.speeds, data),
     }
-    page.write_text(filled(page.read_text("utf-8"), made), encoding="utf-8")
+    page.write_text(filled(page.read_text("utf-8"), texts), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -43,15 +43,15 @@ def results(data: Path) -> list[Result]:
         Result(
             task=task,
             minutes=float(minutes),
-            device=mine[0]["device"],
-            returns=_numbers(mine, "return"),
-            env_steps=float(np.mean(_numbers(mine, "env_steps"))),
-            seconds=float(mine[0]["seconds"]),
+            device=task_rows[0]["device"],
+            returns=_numbers(task_rows, "return"),
+            env_steps=float(np.mean(_numbers(task_rows, "env_steps"))),
+            seconds=float(task_rows[0]["seconds"]),
         )
         for (task, minutes), group in itertools.groupby(
             lines, lambda row: (row["task"], row["minutes"])
         )
-        for mine in [list(group)]
+        for task_rows in [list(group)]
     ]
 
 
@@ -87,13 +87,13 @@ def returns(data: Path) -> str:
         for result in measured
     ]
     for minutes in sorted({result.minutes for result in measured}):
-        mine = [result for result in measured if result.minutes == minutes]
-        mean = float(np.mean([result.returns.mean() for result in mine]))
+        same_budget = [result for result in measured if result.minutes == minutes]
+        mean = float(np.mean([result.returns.mean() for result in same_budget]))
         means = [
-            float(np.mean([column[x.task] for x in mine if x.task in column] or [np.nan]))
+            float(np.mean([column[x.task] for x in same_budget if x.task in column] or [np.nan]))
             for column in published.values()
         ]
-        label = f"mean of {len(mine)} tasks"
+        label = f"mean of {len(same_budget)} tasks"
         lines.append(
             [label, "", f"{minutes:g}", number(mean), "", "", "", *(fixed(x, 0) for x in means)]
         )
@@ -136,12 +136,12 @@ def agreement(data: Path) -> str:
     lines = read(path) if path.exists() else []
     cells: list[Sequence[str]] = []
     for task in TASKS:
-        mine = [row for row in lines if row["task"] == task]
-        ours = _numbers((x for x in mine if x["implementation"] == "ours"), "return")
-        theirs = _numbers((x for x in mine if x["implementation"] != "ours"), "return")
-        if not mine:
+        task_rows = [row for row in lines if row["task"] == task]
+        ours = _numbers((x for x in task_rows if x["implementation"] == "ours"), "return")
+        theirs = _numbers((x for x in task_rows if x["implementation"] != "ours"), "return")
+        if not task_rows:
             continue
         means = (number(float(x.mean())) for x in (ours, theirs))
-        label = f"{task} (seed {mine[0]['seed']})"
+        label = f"{task} (seed {task_rows[0]['seed']})"
         cells.append([label, str(len(ours)), *means, estimate(compare(ours, theirs))])
     return table(["task", "episodes", "here", "Playground", "Playground less here (95%)"], cells)

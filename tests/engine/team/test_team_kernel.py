@@ -205,6 +205,20 @@ def as_without_teams(teams, env):
     return want
 
 
+def as_in_c_mujoco(teams, env):
+    """Returns the episodes of a task that C MuJoCo plays; teams play the same."""
+    actor, act, distribution = player = actor_and_act(env, (5,))
+    policy = choice.ActingPolicy(act, actor, distribution)
+    want = played(choice.choose("mujoco", env, policy, 30).rollout, env, player, num_seeds=2)
+    made = teams()
+    got = played(native.native_rollout, env, player, num_seeds=2)
+    assert [kernel.launch.lanes for kernel in made] == [16, 16]
+    for name in ("observation", "action", "reward"):
+        pair = (getattr(x, name)[:, :20] for x in (got, want))
+        np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
+    return want
+
+
 @pytest.mark.slow
 def test_teams_show_sensors(teams):
     want = as_without_teams(teams, leg(Leg, 60))
@@ -233,15 +247,7 @@ def test_teams_play_models_that_differ_from_episode_to_episode(teams):
 def test_teams_play_mocap_bodies(teams, task):
     spec = mujoco.MjSpec.from_string(LEG.replace("</worldbody>", HAND))
     env = task(xml_file=spec, frame_skip=2, max_episode_steps=30, reward_threshold=None)
-    actor, act, distribution = player = actor_and_act(env, (5,))
-    policy = choice.ActingPolicy(act, actor, distribution)
-    want = played(choice.choose("mujoco", env, policy, 30).rollout, env, player, num_seeds=2)
-    made = teams()
-    got = played(native.native_rollout, env, player, num_seeds=2)
-    assert [kernel.launch.lanes for kernel in made] == [16, 16]
-    for name in ("observation", "action", "reward"):
-        pair = (getattr(x, name)[:, :20] for x in (got, want))
-        np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
+    want = as_in_c_mujoco(teams, env)
     assert (want.observation[..., 10] > 0).any()  # the mocap body is touched
     heights = want.reward[:, 0].ravel()
     assert len(np.unique(heights)) == (heights.size if task is MovedLeg else 1)
@@ -329,15 +335,7 @@ def test_starts_that_show_positions_alone_are_those_of_teams(monkeypatch):
 @pytest.mark.slow
 def test_teams_show_sensors_of_models_that_mjx_refuses(teams):
     env = cylinders(CylinderLeg)
-    actor, act, distribution = player = actor_and_act(env, (5,))
-    policy = choice.ActingPolicy(act, actor, distribution)
-    want = played(choice.choose("mujoco", env, policy, 30).rollout, env, player, num_seeds=2)
-    made = teams()
-    got = played(native.native_rollout, env, player, num_seeds=2)
-    assert [kernel.launch.lanes for kernel in made] == [16, 16]
-    for name in ("observation", "action", "reward"):
-        pair = (getattr(x, name)[:, :20] for x in (got, want))
-        np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
+    want = as_in_c_mujoco(teams, env)
     assert (want.observation[..., 9] > 0).any()  # touch
 
 
