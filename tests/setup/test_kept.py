@@ -134,7 +134,7 @@ def test_a_program_that_launches_a_gpus_kernel_is_kept(monkeypatch):
     monkeypatch.setattr(gpu, "_handler", lambda kernel: gpu._target(kernel.key))
 
     def add(x):
-        return gpu._call(kernel, (1, 1), [jnp.ones(1, jnp.int32)], [x], [x])
+        return gpu._call(kernel, (1, 1), [jnp.ones(1, jnp.int32), x], [x], {1: 0})
 
     place = cache.Cache.find()
     place.keep("key", add, (jax.ShapeDtypeStruct((1,), np.int32),))

@@ -6,7 +6,7 @@ depends on its episode alone: results are the same for any number of workers.
 """
 
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -194,14 +194,31 @@ def play_loop(
     )
 
 
+def is_written_over(arguments: Sequence[Any], results: Sequence[Any]) -> bool:
+    """Returns whether a thread may write the results of a mapped function over its arguments.
+
+    It may if the first arguments are like the results, one by one, as the state is that a step
+    returns. XLA then copies no state in a loop of steps.
+
+    Args:
+      arguments: shapes and dtypes; those without numbers are ignored.
+      results: the same.
+    """
+    sizes = [
+        [(np.prod(x.shape, dtype=int), x.dtype) for x in avals if np.prod(x.shape, dtype=int)]
+        for avals in (arguments, results)
+    ]
+    return len(sizes[1]) > 1 and sizes[0][: len(sizes[1])] == sizes[1]
+
+
 def map_loop(
     program: scalarized.Scalarized, lines: Iterable[str], met: str = "", scratch: Sequence[str] = ()
 ) -> str:
     """Returns the C++ of ``play`` that maps a function.
 
     Its arguments are pointers to: sizes [1] int32 (examples N), the leaves [N, ...] of the
-    function's arguments that are not empty, and those of its result, likewise. A worker without an
-    example computes the last one again beside the others.
+    function's arguments that are not empty, and those of its result, likewise; see
+    ``is_written_over``. A worker without an example computes the last one again beside the others.
 
     Args:
       program: the function.
@@ -223,6 +240,8 @@ def map_loop(
             pointers.append(f"{leaf.type}* out{number} = {row};")
             outputs.append((leaf.type, f"result{number}"))
     parameters = _parameters(inputs, outputs, scratch)
+    if is_written_over(program.in_avals, program.out_avals):
+        parameters = parameters.replace(" __restrict__", "")
     return _MAP_LOOP.format(parameters=parameters, met=met, step="\n".join([*pointers, *lines]))
 
 

@@ -9,14 +9,14 @@ import functools
 import math
 import re
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.engine import objects
-from mjx_reinforce.engine.gpu import cubin, nvrtc
+from mjx_reinforce.engine.gpu import cubin, loops, nvrtc
 from mjx_reinforce.engine.gpu import team_kernel as team
 from mjx_reinforce.engine.gpu.source import WARP
 
@@ -153,7 +153,8 @@ def _launch(
     zeros += [jnp.zeros(shape, jnp.int32) for shape in counts]
     kernel, grid = _sized(kernel, seeds * episodes)
     sizes = jnp.array([seeds, episodes, horizon], jnp.int32)
-    return _call(kernel, grid, [sizes, *args], zeros, zeros)[:-1]
+    aliases = {1 + len(args) + k: k for k in range(len(zeros))}
+    return _call(kernel, grid, [sizes, *args, *zeros], zeros, aliases)[:-1]
 
 
 def launch_map(
@@ -172,7 +173,10 @@ def launch_map(
         sized_kernel, grid = _sized(kernel, examples)
         sizes = jnp.array([examples], jnp.int32)
         batch_shapes = [jax.ShapeDtypeStruct((examples, *x.shape[1:]), x.dtype) for x in shapes]
-        return _call(sized_kernel, grid, [sizes, *args], [], batch_shapes)
+        aliases = {}
+        if kernel.launch.lanes == 1 and loops.is_written_over(args, batch_shapes):
+            aliases = {1 + k: k for k in range(len(batch_shapes))}
+        return _call(sized_kernel, grid, [sizes, *args], batch_shapes, aliases)
 
     return in_one_launch(play)(*args)
 
@@ -181,30 +185,28 @@ def _call(
     kernel: cubin.Kernel,
     grid: tuple[int, int],
     arguments: Sequence[jax.Array],
-    initial: Sequence[jax.Array],
     shapes: Sequence[jax.ShapeDtypeStruct | jax.Array],
+    aliases: Mapping[int, int],
 ) -> Sequence[jax.Array]:
-    """Launches blocks of threads; returns what they make of the initial values of the results.
+    """Launches blocks of threads; returns what they write.
 
-    Where there are none, the threads write all of the results. If the kernel has scratch, it begins
-    with any values.
+    If the kernel has scratch, it begins with any values.
 
     Args:
       kernel: what is launched.
       grid: how many blocks of how many threads.
       arguments: what the kernel reads.
-      initial: values of the results, or none.
-      shapes: their shapes and dtypes.
+      shapes: shapes and dtypes of the results.
+      aliases: the numbers of arguments that the kernel writes results over, and of those results.
+        XLA copies an argument that is read later, and no other.
     """
     scratch = []
     if words := kernel.launch.scratch * math.prod(grid):
         scratch.append(jax.ShapeDtypeStruct((words,), jnp.int32))
-    # XLA lets the kernel write over the initial values, rather than copy them.
-    aliases = {len(arguments) + k: k for k in range(len(initial))}
     blocks, threads = map(np.int32, grid)
     target = _handler(kernel)
-    call = jax.ffi.ffi_call(target, [*shapes, *scratch], input_output_aliases=aliases)
-    return call(*arguments, *initial, blocks=blocks, threads=threads)[: len(shapes)]
+    call = jax.ffi.ffi_call(target, [*shapes, *scratch], input_output_aliases=dict(aliases))
+    return call(*arguments, blocks=blocks, threads=threads)[: len(shapes)]
 
 
 def _sized(kernel: cubin.Kernel, count: int) -> tuple[cubin.Kernel, tuple[int, int]]:

@@ -65,8 +65,15 @@ def mapping_text(program: scalarized.Scalarized) -> Source:
     """Returns the C++ of a kernel that maps; its arguments are those of ``loops.map_loop``."""
     text = ThreadText(lambda number: f"in{number}", {})
     values = text.compile(program.schedule, program.outputs)
+    kinds = [leaf.type for leaf in loops.leaves(program.out_avals)]
+    stores = []
+    # All is read before any of it is written over.
     for number, entries in enumerate(values):
-        text.lines += [f"out{number}[{i}] = {x};" for i, x in enumerate(entries)]
+        for i, x in enumerate(entries):
+            text.line(f"const {kinds[number]} next{number}_{i} = {x};")
+            stores.append(f"out{number}[{i}] = next{number}_{i};")
+    # Where the results are the arguments, a thread without an example leaves them to its owner.
+    text.lines += ["if (item < sizes[0]) {", *stores, "}"]
     return _source(program, loops.map_loop(program, text.lines))
 
 

@@ -221,7 +221,7 @@ def in_memory(monkeypatch, tmp_path):
 
 
 def launch(x):
-    return seam._call(KERNEL, (3, 64), [x], [x], [x])[0]
+    return seam._call(KERNEL, (3, 64), [x, x], [x], {1: 0})[0]
 
 
 def test_a_program_calls_the_handler(in_memory, monkeypatch, tmp_path):
