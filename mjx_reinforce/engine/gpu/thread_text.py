@@ -54,12 +54,16 @@ class ThreadText(Cpp):
         return super().node(node, operands)
 
     def gate(self, gate: LiveGate, values: dict[Node, str]) -> Sequence[str]:
-        """Writes a branch: a long one is taken by all threads if one needs it."""
+        """Writes a branch: a long one is taken by all threads if one needs it.
+
+        What is skippable is entered by those threads alone that need it. Few do, and the others
+        would read and write as much memory as they.
+        """
         names = [self.name() for _ in gate.outs]
         for name, out in zip(names, gate.outs, strict=True):
             self.line(f"{type_of(out.leaf.dtype)} {name} = {self.value(out.cold, values)};")
         predicate = self.value(gate.predicate, values)
-        with self._going_through(gate.body):
+        with self._going_through([] if gate.is_skippable else gate.body):
             self.line(f"if ({self._some(predicate)}) {{")
             scope = self.inside(gate.body, values)
             for name, out in zip(names, gate.outs, strict=True):

@@ -259,13 +259,13 @@ def _along(
             zeros = jnp.zeros((3, *length.shape), residual.dtype)
             single_rows = jax.tree.map(lambda x: x[:, None], all_rows)
             add_row = lambda sums, row: (sums + _of_rows(islands, length, *row), None)  # noqa: E731
-            work, push, stiffness = short_scan(add_row, zeros, single_rows)[0]
+            doubled_work, push, stiffness = short_scan(add_row, zeros, single_rows)[0]
         else:
-            work, push, stiffness = _of_rows(islands, length, *all_rows)
+            doubled_work, push, stiffness = _of_rows(islands, length, *all_rows)
         total_curvature = curvature + stiffness
         return _Mark(
             length=length,
-            cost=length * (slope + length * curvature / 2) + work,
+            cost=length * (slope + length * curvature / 2) + doubled_work / 2,
             slope=slope + length * curvature - push,
             curvature=jnp.where(total_curvature > 0, total_curvature, _MIN_VALUE),
         )
@@ -281,7 +281,7 @@ def _of_rows(
     residual: jax.Array,
     change: jax.Array,
 ) -> jax.Array:
-    """Returns what rows add to the cost along a step, to minus its slope and its curvature.
+    """Returns what rows add to twice the cost along a step, to minus its slope and its curvature.
 
     Arguments are those of ``_along``, and the rows' islands; the result is [3, islands].
     """
@@ -290,13 +290,13 @@ def _of_rows(
     force = rows.force(end_residual)
     # The difference of two costs has no digits where a row stays what it is. There the force is
     # linear in the step, and its mean gives the work, as in C's ``frictionCostDif``.
-    work = jnp.where(
+    doubled_work = jnp.where(
         rows.alike(end_residual, residual),
-        -(rows.force(residual) + force) * step / 2,
-        (rows.cost(end_residual) - rows.cost(residual)) / 2,
+        -(rows.force(residual) + force) * step,
+        rows.cost(end_residual) - rows.cost(residual),
     )
     stiffness = jnp.where(rows.active(end_residual), rows.constraint_mass * change**2, 0)
-    sums = [islands.total(x, labels) for x in (work, force * change, stiffness)]
+    sums = [islands.total(x, labels) for x in (doubled_work, force * change, stiffness)]
     return jnp.stack(sums)
 
 

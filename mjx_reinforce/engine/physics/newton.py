@@ -68,8 +68,12 @@ class Rows(NamedTuple):
 
     def force(self, residual: jax.Array) -> jax.Array:
         """Returns the rows' forces, [rows]."""
-        force = jnp.where(self.active(residual), -self.constraint_mass * residual, 0)
+        force = self.spring(residual)
         return force if self.loss is None else force + self.sliding(residual)
+
+    def spring(self, residual: jax.Array) -> jax.Array:
+        """Returns the forces [rows] of the rows that push as springs, 0 for others."""
+        return jnp.where(self.active(residual), -self.constraint_mass * residual, 0)
 
     def sliding(self, residual: jax.Array) -> jax.Array:
         """Returns the forces [rows] of the rows that slide, 0 for others."""
@@ -82,7 +86,7 @@ class Rows(NamedTuple):
 
     def cost(self, residual: jax.Array) -> jax.Array:
         """Returns twice what each row adds to the cost, [rows]."""
-        cost = jnp.where(self.active(residual), self.constraint_mass * residual**2, 0)
+        cost = -self.spring(residual) * residual
         if self.loss is None:
             return cost
         # The linear branch of Huber's function (``frictionCost`` of C's solver), doubled; the

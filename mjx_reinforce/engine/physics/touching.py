@@ -19,7 +19,7 @@ from mujoco import mjx
 
 from mjx_reinforce.engine.physics.mjx_internals import jax_fields, with_contact
 from mjx_reinforce.engine.physics.rows import make_constraint
-from mjx_reinforce.engine.scalar import is_written_out, writing_out
+from mjx_reinforce.engine.scalar import is_written_out, skippable, writing_out
 
 #: Acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
 Solution = tuple[jax.Array, jax.Array, jax.Array]
@@ -96,7 +96,10 @@ def _with_few(
 
     def solve_all() -> Solution:
         with writing_out():
-            return fallback(model, make_constraint(model, data))
+            solution = fallback(model, make_constraint(model, data))
+        return jax.tree.map(
+            lambda few, all: jnp.where(has_room, few, all), solution_of_few, solution
+        )
 
     # Packed before the branch, which needs the counts.
     packed_contacts = []
@@ -107,7 +110,9 @@ def _with_few(
         packed_contacts.append(kind_contacts)
         counts.append(count)
     has_room = jnp.all(jnp.stack(counts) <= room)
-    return lax.cond(has_room, solve_few, solve_all)
+    solution_of_few = solve_few()
+    # No condition: where one episode has no room, others that play in step with it have.
+    return skippable(~has_room, solve_all, solution_of_few)
 
 
 def _rows_of_one(contact: Any, kind: np.ndarray) -> int:

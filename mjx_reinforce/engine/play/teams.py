@@ -3,14 +3,19 @@
 import ctypes
 from typing import Any
 
-from mjx_reinforce.engine.base import PhysicsModel
+from mjx_reinforce.engine.base import MjModel, PhysicsModel
 from mjx_reinforce.engine.gpu.team_kernel import FEW_WARPS, MANY_WARPS, Physics
 from mjx_reinforce.engine.play import available, c_mujoco
 
 #: Models of fewer degrees of freedom play faster by a thread an episode, if one can play them.
 _LEAST_DOFS = 14
-#: Models of so many degrees of freedom, or more, are played by 32 lanes, others by 16.
+#: Models of so many degrees of freedom, or more, are played by 32 lanes.
 _WIDE_DOFS = 16
+#: Models of so many, or fewer, are played by 8 lanes, others by 16.
+_NARROW_DOFS = 8
+#: With more possible contacts, eight lanes play a narrow model faster where its file allows few
+#: iterations: where too many touch for a thread, it searches with the rows of all.
+_CONTACTS_OF_THREAD = 16
 #: CUDA's number of the attribute of a GPU: bytes of shared memory that a block may have.
 _SHARED_OF_BLOCK = 97
 
@@ -20,12 +25,23 @@ def why_not(env: Any) -> str | None:
     model = physics_model(env)
     if model is None:
         return "it simulates no model of MuJoCo's"
-    can_be_threads = c_mujoco.why_best(env) is None
-    if model.mj_model.nv < _LEAST_DOFS and can_be_threads:
-        return f"a thread plays a model of fewer than {_LEAST_DOFS} degrees of freedom faster"
     from mjx_reinforce.engine.team import tables  # imports MuJoCo
 
+    can_be_threads = c_mujoco.why_best(env) is None
+    if can_be_threads and not _is_for_teams(model.mj_model):
+        return f"a thread plays a model of fewer than {_LEAST_DOFS} degrees of freedom faster"
     return tables.why(model.mj_model, model.random)
+
+
+def _is_for_teams(model: MjModel) -> bool:
+    """Returns whether teams play a model faster than threads."""
+    if model.nv >= _LEAST_DOFS:
+        return True
+    from mjx_reinforce.engine.physics.early_stop import stops_early
+    from mjx_reinforce.engine.team import supported
+
+    is_narrow = model.nv <= _NARROW_DOFS
+    return is_narrow and stops_early(model) and supported.num_parts(model) > _CONTACTS_OF_THREAD
 
 
 def played_by(env: Any) -> str:
@@ -73,7 +89,10 @@ def team_physics(model: PhysicsModel) -> Physics:
 
 def _lanes(model: PhysicsModel) -> int:
     """Returns how many lanes play an episode."""
-    return 32 if model.mj_model.nv >= _WIDE_DOFS else 16
+    num_dofs = model.mj_model.nv
+    if num_dofs <= _NARROW_DOFS:
+        return 8
+    return 32 if num_dofs >= _WIDE_DOFS else 16
 
 
 def _shared_memory() -> int:

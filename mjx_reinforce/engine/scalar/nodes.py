@@ -152,6 +152,7 @@ class Gate:
     hot: the results if some lane needs it, each lane's own already selected.
     cold: the results if none does.
     outs: the leaf that stands for each result; None where hot and cold are the same.
+    is_skippable: whether it is of ``skippable``, and not of a condition.
     """
 
     scope: Scope
@@ -161,6 +162,7 @@ class Gate:
     hot: list[Scalar]
     cold: list[Scalar]
     outs: list[Node | None] = dataclasses.field(default_factory=list)
+    is_skippable: bool = False
 
 
 @dataclasses.dataclass(eq=False, slots=True)

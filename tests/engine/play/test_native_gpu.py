@@ -351,3 +351,40 @@ def test_mapped_over_it_remains_one_launch(monkeypatch):
 def test_machine_code_for_a_gpu_is_chosen(monkeypatch):
     gpu_on_cpu.emulate(monkeypatch)
     assert make_vec(TOY, 4).engine.name == "native"
+
+
+def _turned(x, y, count):
+    """A step whose results are places of one another."""
+    return y, jnp.where(count > 2, x, -y), count + 1
+
+
+def test_a_step_is_written_over_its_arguments(monkeypatch):
+    """All is read first; a thread without an example leaves the last one to the thread that has."""
+    rng = np.random.default_rng(0)
+    x, y = jnp.asarray(rng.normal(size=(2, 7, 3)), jnp.float32)
+    state = x, y, jnp.arange(7, dtype=jnp.int32)
+    block = gpu_on_cpu.Block(4)
+    gpu_on_cpu.emulate(monkeypatch, block=block)
+    called, call = [], seam._call
+
+    def noted(kernel, grid, arguments, shapes, aliases):
+        called.append(aliases)
+        return call(kernel, grid, arguments, shapes, aliases)
+
+    monkeypatch.setattr(seam, "_call", noted)
+    step = program.machine_map(_turned, x[0], y[0], jnp.int32(0))
+    got = jax.jit(lambda state: step(*step(*state)))(state)
+    for values, exact in zip(got, _turned(*_turned(x, y, state[2][:, None])), strict=True):
+        np.testing.assert_array_equal(values, exact.reshape(values.shape))
+    assert called == [{1: 0, 2: 1, 3: 2}] * 2
+    assert block.apart is None
+
+
+def test_other_functions_leave_their_arguments(monkeypatch):
+    gpu_on_cpu.emulate(monkeypatch)
+    called = []
+    monkeypatch.setattr(seam, "_call", lambda *given: called.append(given[-1]) or given[-2])
+    x, n = jnp.ones((7, 3)), jnp.zeros(7, jnp.int32)
+    for function in (lambda x, n: (n, x), lambda x, n: (x, n, n), lambda x, n: x):
+        jax.eval_shape(program.machine_map(function, x[0], n[0]), x, n)
+    assert called == [{}] * 3

@@ -3,6 +3,8 @@
 import types
 
 import jax
+import mujoco
+import pytest
 
 from mjx_reinforce import envs
 from mjx_reinforce.engine import base, scalar
@@ -60,6 +62,36 @@ def test_random_fields_are_part_of_a_model():
     geared.mj_model.actuator_damping[0] = 1
     reason = "the model has random gears of actuators with armature or damping, which teams of"
     assert str(teams.why_not(geared)).startswith(reason)
+
+
+def chain(num_dofs, capsules, iterations):
+    """An environment of joints, the last body of which may touch the floor with capsules."""
+    parts = '<geom type="capsule" fromto="0 0 0 1 0 0" size=".1" contype="0"/>' * capsules
+    for _ in range(num_dofs):
+        inertial = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+        parts = f'<body><joint axis="0 1 0"/>{inertial}{parts}</body>'
+    option = f'<option iterations="{iterations}"/>'
+    floor = '<geom type="plane" size="1 1 1"/>'
+    xml = f"<mujoco>{option}<worldbody>{floor}{parts}</worldbody></mujoco>"
+    model = mujoco.MjModel.from_xml_string(xml)  # pyright: ignore[reportAttributeAccessIssue]
+    return types.SimpleNamespace(physics_model=lambda: base.PhysicsModel(model, 1, "chain"))
+
+
+@pytest.mark.parametrize(
+    ("num_dofs", "capsules", "iterations", "player"),
+    [
+        (7, 9, 4, "8 lanes"),
+        (7, 8, 4, "a thread"),
+        (7, 9, 100, "a thread"),
+        (9, 9, 4, "a thread"),
+        (14, 1, 100, "16 lanes"),
+        (16, 1, 4, "32 lanes"),
+    ],
+)
+def test_what_plays_a_model(num_dofs, capsules, iterations, player):
+    """Eight lanes, where few iterations are allowed and many contacts are possible."""
+    env = chain(num_dofs, capsules, iterations)
+    assert teams.played_by(env).startswith(f"{player} an episode")
 
 
 def test_an_environment_need_not_offer_a_model():

@@ -75,11 +75,13 @@ class LiveGate:
     predicate: which lanes need the branch.
     body: what it computes.
     outs: its results.
+    is_skippable: whether it is of ``skippable``, and not of a condition.
     """
 
     predicate: Node
     body: "Schedule"
     outs: list[Out]
+    is_skippable: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -243,7 +245,7 @@ class _Needs:
             for i in sorted(self._outs[gate])
             if (leaf := gate.outs[i]) is not None
         ]
-        return LiveGate(gate.predicate, self.steps_of(gate.body), outs)
+        return LiveGate(gate.predicate, self.steps_of(gate.body), outs, gate.is_skippable)
 
     def _loop(self, loop: Loop) -> LiveLoop:
         """Returns a loop with what is needed of its carry, its elements and its ys."""

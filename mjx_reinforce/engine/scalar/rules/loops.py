@@ -219,7 +219,10 @@ def skippable_rule(
     if body is None:
         return out_layout.pack(compute())
     # In a lane that does not need it the result equals ``default``, so nothing is selected.
-    return out_layout.pack(_close(graph, body, predicate, body.results, out_layout.unpack(default)))
+    cold_values = out_layout.unpack(default)
+    return out_layout.pack(
+        _close(graph, body, predicate, body.results, cold_values, is_skippable=True)
+    )
 
 
 def whole_rule(
@@ -314,10 +317,17 @@ def _gate(graph: Graph, body: _Body, flag: Node, fallback: list[Scalar] | None) 
 
 
 def _close(
-    graph: Graph, body: _Body, flag: Node, hot_values: list[Scalar], cold_values: list[Scalar]
+    graph: Graph,
+    body: _Body,
+    flag: Node,
+    hot_values: list[Scalar],
+    cold_values: list[Scalar],
+    *,
+    is_skippable: bool = False,
 ) -> list[Scalar]:
     """Gives a branch its place; returns its results."""
     gate = Gate(graph.scope, graph.number(), flag, body.scope, hot_values, cold_values)
+    gate.is_skippable = is_skippable
     for position, (hot, cold) in enumerate(zip(hot_values, cold_values, strict=True)):
         varying = any(isinstance(value, Node) and value.varying for value in (hot, cold))
         leaf = None
