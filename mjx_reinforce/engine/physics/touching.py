@@ -7,6 +7,7 @@ would compute both sides of every branch, solves with the rows of all contacts.
 """
 
 import contextlib
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -97,9 +98,7 @@ def _with_few(
     def solve_all() -> Solution:
         with writing_out():
             solution = fallback(model, make_constraint(model, data))
-        return jax.tree.map(
-            lambda few, all: jnp.where(has_room, few, all), solution_of_few, solution
-        )
+        return jax.tree.map(functools.partial(jnp.where, has_room), solution_of_few, solution)
 
     # Packed before the branch, which needs the counts.
     packed_contacts = []
