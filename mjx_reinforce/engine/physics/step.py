@@ -165,8 +165,12 @@ def _solve_in_steps(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Ar
     if not jax_fields(data).contact.dim.size:  # MJX's solver fails on elliptic cones of none
         model = model.replace(opt=model.opt.replace(cone=mjx.ConeType.PYRAMIDAL))
     if newton.supports(model) and early_stop.stops_early(model):
-        # The same search where contacts have no room: another one would stop elsewhere.
-        return touching.solve_touching(early_stop.solve, early_stop.solve, model, data)
+        # The same search where contacts have no room: another one would stop elsewhere. With all
+        # rows it takes long, so that half as much more room is tried before.
+        roomier = functools.partial(
+            touching.solve_touching, early_stop.solve, early_stop.solve, contacts_per_dof=0.6
+        )
+        return touching.solve_touching(early_stop.solve, roomier, model, data)
     if newton.supports(model):
         return touching.solve_touching(newton.solve_newton, newton.solve_in_loops, model, data)
     data = mjx.solve(model, data)

@@ -157,7 +157,7 @@ def assert_equal(ours, theirs):
 def test_contacts(monkeypatch):
     """Where there is room in `touching` for those that touch, and where there is not."""
     room = 2
-    monkeypatch.setattr(touching, "_room", lambda model: room)
+    monkeypatch.setattr(touching, "_room", lambda *_: room)
     with jax.enable_x64(True):
         env = Scene(FEET)
         ours, theirs = forwards(env)

@@ -16,7 +16,7 @@ from mjx_reinforce import Box, make_vec
 from mjx_reinforce.engine.gpu import cubin, loops, nvrtc, seam, thread_kernel, thread_text
 from mjx_reinforce.engine.physics import touching
 from mjx_reinforce.engine.play import available, native, program, rollouts
-from mjx_reinforce.engine.scalar import scalarized
+from mjx_reinforce.engine.scalar import scalarized, skippable
 
 if reason := available.unavailable():
     pytest.skip(reason, allow_module_level=True)
@@ -97,7 +97,7 @@ def test_in_step_or_apart_an_episode_is_the_same(busy, monkeypatch):
 
 @pytest.mark.slow
 def test_threads_meet_where_some_have_no_room_for_their_contacts(monkeypatch):
-    monkeypatch.setattr(touching, "_room", lambda model: 1)
+    monkeypatch.setattr(touching, "_room", lambda *_: 1)
     env = Scene(THREE_FEET)
     who = actor_and_act(env, ())
     size = {"num_episodes": 12, "horizon": 2}
@@ -110,6 +110,22 @@ def test_threads_meet_where_some_have_no_room_for_their_contacts(monkeypatch):
     monkeypatch.setattr(thread_text, "LONG_BODY", 0)
     assert_identical(played(native.native_rollout, env, who, **size), want)
     assert block.apart is None
+
+
+@pytest.mark.parametrize(("branch", "meetings"), [(skippable, 1), (jax.lax.cond, 3)])
+def test_what_is_skippable_is_entered_alone(branch, meetings, monkeypatch):
+    """Threads meet before an example, and at a condition and its loop."""
+    monkeypatch.setattr(thread_text, "LONG_BODY", 0)
+
+    def halved(x):
+        def halve():
+            return jax.lax.while_loop(lambda x: x > 1, lambda x: x / 2, x)
+
+        return branch(x > 1, halve, x if branch is skippable else lambda: x)
+
+    traced = scalarized.trace(halved, jnp.float32(0), unrolled=25)
+    text = thread_kernel.mapping_text(scalarized.build(*traced, 0, 1)).text
+    assert text.partition("KERNEL play(")[2].count("t.meet(") == meetings
 
 
 def player_text(env, actor, act, distribution):
