@@ -169,6 +169,7 @@ def launch_map(
     """
 
     def play(*args):
+        """Launches one kernel for all examples."""
         examples = len(args[0])
         sized_kernel, grid = _sized(kernel, examples)
         sizes = jnp.array([examples], jnp.int32)
