@@ -197,8 +197,8 @@ def play_loop(
 def is_written_over(arguments: Sequence[Any], results: Sequence[Any]) -> bool:
     """Returns whether a thread may write the results of a mapped function over its arguments.
 
-    It may if the first arguments are like the results, one by one, as the state is that a step
-    returns. XLA then copies no state in a loop of steps.
+    It may if the first arguments are like the several results, one by one, as the state is that a
+    step returns. XLA then copies no state in a loop of steps.
 
     Args:
       arguments: shapes and dtypes; those without numbers are ignored.
