@@ -22,7 +22,7 @@ WARP_ROOM = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZ
 
 
 def peers(env_id: str) -> list[Candidate]:
-    """C MuJoCo on all threads, and Gymnasium's vector environment and EnvPool where they can run."""
+    """C MuJoCo on all threads; Gymnasium's vector environment and EnvPool where they can run."""
     candidates = [c_mujoco(env_id)] if hasattr(make(env_id), "mj_model") else []
     if _in_gymnasium(env_id):
         candidates.append(gymnasium_vector(env_id))

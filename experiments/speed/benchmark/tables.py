@@ -168,10 +168,10 @@ def readme(raw: Raw) -> str:
     on_cpu, equal = (best(raw.cpu, FEW[2], "native", x) for x in ("float32", "float64"))
     other = best(raw.cpu, FEW[2], "C MuJoCo")
     return textwrap.fill(
-        f"On one {card(on_gpu)}, HalfCheetah runs {rate(on_gpu)} env steps per second, "
-        f"{ratio(on_gpu, warp)} times as many as in MuJoCo Warp. On two CPU cores, it runs "
-        f"{rate(on_cpu)}, "
-        f"{ratio(on_cpu, other)} times as many as in C MuJoCo ({ratio(equal, other)} in float64).",
+        f"On one {card(on_gpu)}, HalfCheetah with an untrained policy runs {rate(on_gpu)} env "
+        f"steps per second, {ratio(on_gpu, warp)} times as many as under random actions in MuJoCo Warp. "
+        f"On two CPU cores, it runs {rate(on_cpu)}, {ratio(on_cpu, other)} times as many as in C "
+        f"MuJoCo ({ratio(equal, other)} in float64).",
         110,
     )
 
