@@ -169,9 +169,9 @@ def readme(raw: Raw) -> str:
     other = best(raw.cpu, FEW[2], "C MuJoCo")
     return textwrap.fill(
         f"On one {card(on_gpu)}, HalfCheetah with an untrained policy runs {rate(on_gpu)} env "
-        f"steps per second, {ratio(on_gpu, warp)} times as many as under random actions in MuJoCo Warp. "
-        f"On two CPU cores, it runs {rate(on_cpu)}, {ratio(on_cpu, other)} times as many as in C "
-        f"MuJoCo ({ratio(equal, other)} in float64).",
+        f"steps per second, {ratio(on_gpu, warp)} times as many as under random actions in MuJoCo "
+        f"Warp. On two CPU cores, it runs {rate(on_cpu)}, {ratio(on_cpu, other)} times as many as "
+        f"in C MuJoCo ({ratio(equal, other)} in float64).",
         110,
     )
 
