@@ -1,7 +1,7 @@
 """Trains on several devices of one process, and compares what comes out with one device's.
 
 ``python divided.py '[["run", {"num_episodes": 8}, [{"episodes": 8}]]]'`` takes what is compared, a
-whole ``run`` or a ``step`` of its learner, then the settings, and the ways in which they are divided.
+whole ``run`` or a ``step`` of its learner, then the settings, and the ways of dividing them.
 Prints a line for each way; raises where something differs.
 """
 
