@@ -20,6 +20,8 @@ from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 
+from mjx_reinforce.engine.checks import check_name
+
 #: Asks for descriptions.
 DEBUG = "MJX_REINFORCE_DEBUG"
 #: Where a folder holds more bytes than this, what was used longest ago goes.
@@ -167,8 +169,14 @@ def make_folder(folder: Path) -> None:
 
 
 def is_described() -> bool:
-    """Returns whether objects are described, and therefore made even if the disk has them."""
-    return os.environ.get(DEBUG, "0") not in ("", "0")
+    """Returns whether objects are described, and therefore made even if the disk has them.
+
+    Raises:
+      ValueError: the variable is neither 0 nor 1.
+    """
+    value = os.environ.get(DEBUG) or "0"
+    check_name(DEBUG, value, {"0": False, "1": True})
+    return value == "1"
 
 
 def describe(key: str, description: str) -> None:

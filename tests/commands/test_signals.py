@@ -135,7 +135,7 @@ def test_an_ssh_that_ends_is_answered_as_sigterm(tmp_path):
         process = start(tmp_path, *FOREVER)
     finally:
         signal.signal(signal.SIGHUP, before)
-    wait_for(lambda: rows(tmp_path) > 20, process)
+    wait_for(lambda: rows(tmp_path) > 3, process)
     for _ in range(2):
         process.send_signal(signal.SIGHUP)
         time.sleep(0.05)
@@ -152,10 +152,10 @@ def test_nohup_keeps_a_run_going(tmp_path):
         process = start(tmp_path, *FOREVER)
     finally:
         signal.signal(signal.SIGHUP, before)
-    wait_for(lambda: rows(tmp_path) > 20, process)
+    wait_for(lambda: rows(tmp_path) > 3, process)
     process.send_signal(signal.SIGHUP)
     reached = rows(tmp_path)
-    wait_for(lambda: rows(tmp_path) > reached + 20, process)
+    wait_for(lambda: rows(tmp_path) > reached + 3, process)
     process.send_signal(signal.SIGTERM)
     assert finish(process) == 128 + signal.SIGTERM
 

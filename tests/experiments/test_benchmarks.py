@@ -1,9 +1,12 @@
 """The tables of speed say what docs/benchmarks.csv says, and its rows say all of a measurement."""
 
+import time
+
 import pytest
 
 from experiments.kit.rows import threads
 from experiments.speed.benchmark import rows, tables
+from experiments.speed.benchmark.__main__ import shared_clock
 from experiments.speed.benchmark.peers import c_mujoco
 
 ROW = {
@@ -51,6 +54,26 @@ def test_c_mujoco_stands_beside_its_own_precision_of_the_same_call():
     assert cells == ["Hopper-v5", "512 x 20", "2.00e6", "4.00e5", "1.00e5", "4.0", "20", ""]
     sentence = " ".join(tables.words(raw).splitlines())
     assert "4.0 (Hopper) to 4.0 (Hopper) times as fast as C MuJoCo in float64" in sentence
+
+
+def test_rows_beside_envpool_have_calls_of_their_own():
+    """A later call with EnvPool, on another machine, leaves the table of two cores as it is."""
+    later = {"date": "2026-11-25T12:00:00", "env_steps_per_second": [8e5]}
+    pool = C | later | {"engine": "EnvPool", "env_steps_per_second": [2e5]}
+    raw = tables.last_calls([ROW, DOUBLE, C, *(row | later for row in (ROW, DOUBLE, C)), pool])
+    assert "| 2.00e6 | 4.00e5 | 1.00e5 |" in tables.cpu(raw)
+    assert tables.envpool(raw).splitlines()[-1] == (
+        "| Hopper-v5 | 8.00e5 | 8.00e5 | 8.00e5 | 2.00e5 | 4.0 | 4.0 |"
+    )
+
+
+def test_a_busy_machine_counts_what_is_computed():
+    """Not the seconds that pass."""
+    waiting = rows.Candidate(ROW, lambda: time.sleep(0.2), 1)
+    (by_cpu,) = rows.measure([waiting], 1, shared_clock)
+    (by_wall,) = rows.measure([waiting], 1)
+    assert rows.speed(by_wall) < 5.1
+    assert rows.speed(by_cpu) > 20
 
 
 def test_few_episodes_have_calls_of_their_own():

@@ -1,8 +1,8 @@
 """Trains on several devices of one process, and compares what comes out with one device's.
 
-``python divided.py run '{"num_episodes": 8}' '{"episodes": 8}'`` takes what is compared, a whole
-``run`` or a ``step`` of its learner, then the settings, and how they are divided. Prints nothing;
-raises where something differs.
+``python divided.py '[["run", {"num_episodes": 8}, [{"episodes": 8}]]]'`` takes what is compared, a
+whole ``run`` or a ``step`` of its learner, then the settings, and the ways of dividing them.
+Prints a line for each way; raises where something differs.
 """
 
 import json
@@ -65,19 +65,28 @@ def stepped(config, division):
     return learner, jax.device_get(step(jax.random.split(jax.random.key(1), config.num_seeds)))
 
 
-def main():
-    kind, settings, division = sys.argv[1], json.loads(sys.argv[2]), json.loads(sys.argv[3])
+def compare(kind, settings, divisions):
+    """Compares what each way of dividing comes to with what one device does, computed once."""
     settings = SMALL | {"env": "CartPole-v1"} | settings
     config = Config(**{k: tuple(x) if isinstance(x, list) else x for k, x in settings.items()})
-    division = Division(**division)
     if kind == "run":
-        close(trained(config, ALONE), trained(config, division))
+        alone = trained(config, ALONE)
+        for division in divisions:
+            close(alone, trained(config, Division(**division)))
+            print("equal", kind, settings, division)
         return
     learner, (episodes, *learned) = stepped(config, ALONE)
-    again, *other = stepped(config, division)[1]
-    close(learned, other)
     alike = np.testing.assert_array_equal if learner.engine.name == "native" else close
-    jax.tree.map(alike, episodes, again)
+    for division in divisions:
+        again, *other = stepped(config, Division(**division))[1]
+        close(learned, other)
+        jax.tree.map(alike, episodes, again)
+        print("equal", kind, settings, division)
+
+
+def main():
+    for variant in json.loads(sys.argv[1]):
+        compare(*variant)
 
 
 if __name__ == "__main__":

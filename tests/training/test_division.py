@@ -17,14 +17,17 @@ from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training import resume
 from mjx_reinforce.training.division import ALONE, Division
 
-#: What is compared, the settings, and how that is divided.
+#: What is compared, the settings, and how that is divided. Those of a name share a process.
 VARIANTS = {
-    "episodes": ("run", {}, {"episodes": 8}),
-    "seeds": ("run", {}, {"seeds": 3}),
-    "ars": ("run", {"algorithm": "ars", "engine": "vmap"}, {"seeds": 2}),
-    "value": ("step", {"estimator": "value-baseline"}, {"episodes": 8}),
-    "natural": ("step", {"update": "natural-gradient", "max_kl": 0.01}, {"episodes": 8}),
-    "minibatches": ("step", {"algorithm": "continuous-cartpole"}, {"episodes": 2}),
+    "runs": [
+        ("run", {}, [{"episodes": 8}, {"seeds": 3}]),
+        ("run", {"algorithm": "ars", "engine": "vmap"}, [{"seeds": 2}]),
+    ],
+    "steps": [
+        ("step", {"estimator": "value-baseline"}, [{"episodes": 8}]),
+        ("step", {"update": "natural-gradient", "max_kl": 0.01}, [{"episodes": 8}]),
+        ("step", {"algorithm": "continuous-cartpole"}, [{"episodes": 2}]),
+    ],
 }
 
 
@@ -43,9 +46,9 @@ def on_devices(count, folder, *line):
 @pytest.mark.cpu
 @pytest.mark.parametrize("name", VARIANTS)
 def test_devices_change_nothing_but_rounding(tmp_path, name):
-    kind, *given = VARIANTS[name]
     program = str(ROOT / "tests" / "helpers" / "divided.py")
-    on_devices(8, tmp_path, program, kind, *map(json.dumps, given))
+    printed = on_devices(8, tmp_path, program, json.dumps(VARIANTS[name]))
+    assert printed.count("equal") == sum(len(divisions) for *_, divisions in VARIANTS[name])
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ from typing import IO, Literal, NamedTuple
 
 import tyro
 
-from experiments.kit.rows import now
+from experiments.kit.rows import now, threads
 from experiments.speed.benchmark.rows import RAW, Candidate
 
 
@@ -122,6 +122,9 @@ class Settings:
     numbers if not given. With few of them the rows tell how long an env step takes."""
     steps: int = 0
     """On a GPU, env steps of native's episodes; the task's own number if 0."""
+    busy: bool = False
+    """On a CPU with other jobs: count the seconds that the process's threads compute, divided by
+    their number, not those that pass."""
     shrink: int = 1
     """Divide episodes and worlds by this, to try the script; such rows are worth nothing."""
     worker: str = ""
@@ -190,6 +193,7 @@ def start(task: str, index: int, date: str, settings: Settings) -> subprocess.Po
     command += ["--tasks", task, "--worker", date]
     for name in ("minutes", "csv", "commit", "repeats", "steps", "shrink"):
         command.append(f"--{name}={getattr(settings, name)}")
+    command += ["--busy"] if settings.busy else []
     runs = [str(run) for run in settings.runs if task_of(run) == task]
     command += ["--runs", *runs] if runs else []
     if settings.batches:
@@ -251,11 +255,20 @@ def work(settings: Settings) -> None:
     if sys.stdin.readline().strip() != "go":
         return
     said = facts(settings.worker, settings.commit)
-    rows = [row | said for row in measure(candidates(), settings.repeats)]
+    clock = shared_clock if settings.busy else time.perf_counter
+    rows = [row | said for row in measure(candidates(), settings.repeats, clock)]
+    if settings.busy:
+        for row in rows:
+            row["settings"] = "; ".join(filter(None, (row["settings"], "seconds of the CPU")))
     append(settings.csv, rows)
     for row in rows:
         words = (row[key] for key in ("task", "what", "engine", "precision", "batch"))
         print(*words, f"{speed(row):.3g} env steps/s", sep=", ", flush=True)
+
+
+def shared_clock() -> float:
+    """Returns the seconds that this process's threads have computed, divided by their number."""
+    return time.process_time() / threads()
 
 
 def task_of(run: Path) -> str:

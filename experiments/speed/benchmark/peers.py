@@ -1,5 +1,6 @@
 """What a user would otherwise pick, as far as it is installed here, to be timed."""
 
+import ctypes
 import functools
 import importlib.util
 import math
@@ -12,6 +13,8 @@ from experiments.kit.rows import threads
 from experiments.speed.benchmark.robots import make
 from experiments.speed.benchmark.rows import Candidate
 
+#: MuJoCo Warp by itself, not the copy in MJX.
+WARP_PACKAGES = "mujoco-warp==4.0.0 warp-lang==1.19.0"
 #: Env steps that MuJoCo Warp's worlds have gone through before they are timed.
 WARP_BEFORE = 50
 #: What MuJoCo Warp may have too little room for: `OverflowType`, without the limits of iterations.
@@ -19,10 +22,12 @@ WARP_ROOM = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZ
 
 
 def peers(env_id: str) -> list[Candidate]:
-    """C MuJoCo on all threads, and Gymnasium's vector environment where it can run."""
+    """C MuJoCo on all threads; Gymnasium's vector environment and EnvPool where they can run."""
     candidates = [c_mujoco(env_id)] if hasattr(make(env_id), "mj_model") else []
     if _in_gymnasium(env_id):
         candidates.append(gymnasium_vector(env_id))
+    if _in_envpool(env_id):
+        candidates.append(envpool_vector(env_id))
     return candidates
 
 
@@ -58,9 +63,13 @@ def mujoco_warp(env_id: str, batch: int, steps: int = 20) -> Candidate:
     come to contacts. One CUDA graph plays an env step. There is room for what `warp_room` finds,
     doubled until those steps need no more.
 
-    Raises (when run):
-      RuntimeError: a world came to need more.
+    Raises:
+      ImportError: it is not installed.
+      RuntimeError: a world came to need more (when run).
     """
+    for name in ("mujoco_warp", "warp"):
+        if not importlib.util.find_spec(name):
+            raise ImportError(f"there is no package {name}: pip install {WARP_PACKAGES}")
     import mujoco_warp  # pyright: ignore
     import warp  # pyright: ignore
     from mujoco import mj_forward  # type: ignore
@@ -179,6 +188,33 @@ def gymnasium_vector(env_id: str, batch: int = 8, steps: int = 50) -> Candidate:
     return Candidate(row, run, batch * steps)
 
 
+def envpool_vector(env_id: str, batch: int = 64, steps: int = 40) -> Candidate:
+    """EnvPool's environment of this name under random actions, on all threads; no policy.
+
+    It waits for all of the batch in each step, and starts episodes that are over again.
+    """
+    import envpool  # pyright: ignore
+    from envpool.mujoco import mujoco_gym_envpool  # pyright: ignore
+
+    env = envpool.make_gymnasium(env_id, num_envs=batch, num_threads=threads(), seed=0)
+    env.reset()
+    low, high = env.action_space.low, env.action_space.high
+    actions = np.random.default_rng(0).uniform(low, high, (steps, batch, *low.shape))
+    actions = actions.astype(env.action_space.dtype)
+
+    def run():
+        for action in actions:
+            env.step(action)
+
+    library = ctypes.CDLL(mujoco_gym_envpool.__file__)
+    library.mj_versionString.restype = ctypes.c_char_p
+    row = {"what": "rollout, no policy", "engine": "EnvPool", "task": env_id}
+    row |= {"precision": "float64", "batch": batch, "steps": steps, "device": "cpu"}
+    inner = library.mj_versionString().decode()
+    row["settings"] = f"{threads()} threads; envpool {envpool.__version__}, MuJoCo {inner} in it"
+    return Candidate(row, run, batch * steps)
+
+
 def _start(model: Any) -> Any:
     """Returns a simulation at the model's first key frame, or at its pose."""
     from mujoco import MjData, mj_resetDataKeyframe  # type: ignore
@@ -202,3 +238,11 @@ def _in_gymnasium(env_id: str) -> bool:
     import gymnasium
 
     return env_id in gymnasium.registry
+
+
+def _in_envpool(env_id: str) -> bool:
+    if not importlib.util.find_spec("envpool"):
+        return False
+    import envpool  # pyright: ignore
+
+    return env_id in envpool.list_all_envs()

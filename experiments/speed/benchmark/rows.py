@@ -35,15 +35,17 @@ class Candidate(NamedTuple):
     env_steps: int
 
 
-def measure(candidates: list[Candidate], repeats: int) -> list[dict[str, Any]]:
+def measure(
+    candidates: list[Candidate], repeats: int, clock: Callable[[], float] = time.perf_counter
+) -> list[dict[str, Any]]:
     """Times all candidates in turn, several times; returns their rows, speeds in order."""
     times: list[list[float]] = [[] for _ in candidates]
     for repeat in range(repeats + 1):
         for candidate, taken in zip(candidates, times, strict=True):
-            started = time.perf_counter()
+            started = clock()
             candidate.run()
             if repeat:  # the first warms up
-                taken.append(time.perf_counter() - started)
+                taken.append(clock() - started)
     timed = []
     for candidate, taken in zip(candidates, times, strict=True):
         speeds = [candidate.env_steps / seconds for seconds in taken]

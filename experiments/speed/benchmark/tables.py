@@ -31,10 +31,12 @@ class Raw(NamedTuple):
 
     gpu: on a GPU, and C MuJoCo on its machine
     cpu: on two cores
+    envpool: on two cores, where EnvPool is installed
     """
 
     gpu: list[dict[str, Any]]
     cpu: list[dict[str, Any]]
+    envpool: list[dict[str, Any]]
 
 
 def last_calls(rows: list[dict[str, Any]]) -> Raw:
@@ -43,14 +45,20 @@ def last_calls(rows: list[dict[str, Any]]) -> Raw:
     Few episodes have calls of their own (``--batches``), and so a last one.
     """
     on_gpu = {row["date"] for row in rows if row["device"] != "cpu"}
+    beside = {row["date"] for row in rows if row["engine"] == "EnvPool"}
 
-    def kind(row: dict[str, Any]) -> tuple[str, bool, bool]:
-        return row["task"], row["date"] in on_gpu, row["batch"] in SMALL
+    def place(row: dict[str, Any]) -> int:
+        """Returns the field of ``Raw`` that a row is in."""
+        if row["date"] in beside:
+            return 2
+        return int(row["date"] not in on_gpu)
+
+    def kind(row: dict[str, Any]) -> tuple[str, int, bool]:
+        return row["task"], place(row), row["batch"] in SMALL
 
     last = {kind(row): row["date"] for row in sorted(rows, key=_date)}
     now = [row for row in rows if row["date"] == last[kind(row)]]
-    gpu, cpu = ([row for row in now if (row["date"] in on_gpu) == it] for it in (True, False))
-    return Raw(gpu, cpu)
+    return Raw(*([row for row in now if place(row) == number] for number in range(3)))
 
 
 def _date(row: dict[str, Any]) -> str:
@@ -160,10 +168,10 @@ def readme(raw: Raw) -> str:
     on_cpu, equal = (best(raw.cpu, FEW[2], "native", x) for x in ("float32", "float64"))
     other = best(raw.cpu, FEW[2], "C MuJoCo")
     return textwrap.fill(
-        f"On one {card(on_gpu)}, HalfCheetah runs {rate(on_gpu)} env steps per second, "
-        f"{ratio(on_gpu, warp)} times as many as in MuJoCo Warp. On two CPU cores, it runs "
-        f"{rate(on_cpu)}, "
-        f"{ratio(on_cpu, other)} times as many as in C MuJoCo ({ratio(equal, other)} in float64).",
+        f"On one {card(on_gpu)}, HalfCheetah with an untrained policy runs {rate(on_gpu)} env "
+        f"steps per second, {ratio(on_gpu, warp)} times as many as under random actions in MuJoCo "
+        f"Warp. On two CPU cores, it runs {rate(on_cpu)}, {ratio(on_cpu, other)} times as many as "
+        f"in C MuJoCo ({ratio(equal, other)} in float64).",
         110,
     )
 
@@ -247,6 +255,19 @@ def cpu(raw: Raw) -> str:
     return f"{origin(raw.cpu)}\n\n{table(header, rows)}"
 
 
+def envpool(raw: Raw) -> str:
+    """Tasks that EnvPool has, too."""
+    rows = []
+    for task in tasks_of(raw.envpool):
+        single, double = (best(raw.envpool, task, "native", x) for x in ("float32", "float64"))
+        c_mujoco, pool = (best(raw.envpool, task, x) for x in ("C MuJoCo", "EnvPool"))
+        cells = (rate(single), rate(double), rate(c_mujoco), rate(pool))
+        rows.append((short(task), *cells, ratio(double, pool), ratio(single, pool)))
+    header = ("task", "native, float32", "native, float64", "C MuJoCo", "EnvPool")
+    shown = table((*header, "float64 / EnvPool", "float32 / EnvPool"), rows)
+    return f"{origin(raw.envpool)}\n\n{shown}"
+
+
 TABLES: dict[str, Callable[[Raw], str]] = {
     "speed": readme,
     "speed in words": words,
@@ -254,6 +275,7 @@ TABLES: dict[str, Callable[[Raw], str]] = {
     "speed with trained policies": trained,
     "milliseconds": latency,
     "speed on two cores": cpu,
+    "speed beside EnvPool": envpool,
 }
 
 

@@ -73,6 +73,17 @@ class Code(NamedTuple):
         return self.future_addresses.result()
 
 
+def asked_level() -> str:
+    """Returns what the variable asks for: one of ``LEVELS``, or ``HOST`` if it is not set.
+
+    Raises:
+      ValueError: it is none of these.
+    """
+    level = os.environ.get(VARIABLE) or HOST
+    check_name(VARIABLE, level, {HOST: None, **LEVELS})
+    return level
+
+
 def this_machine(level: str | None = None) -> Machine:
     """Returns this machine, or it at an older level of x86-64.
 
@@ -85,14 +96,13 @@ def this_machine(level: str | None = None) -> Machine:
     """
     import llvmlite.binding as llvm
 
-    level = level or os.environ.get(VARIABLE) or HOST
+    level = level or asked_level()
     triple = llvm.get_process_triple()
     try:
         features = llvm.get_host_cpu_features()
     except RuntimeError:  # where LLVM cannot ask, as on some ARM systems, the name says it
         features = llvm.targets.FeatureMap()
     if level != HOST:
-        check_name(VARIABLE, level, LEVELS)
         lanes = _check_level(level, triple, features)
         return Machine(triple, level, _WIDTH if lanes == 16 else "", lanes)
     if features.get("avx512f"):

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 
+from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.gpu import seam as gpu
 
@@ -69,6 +70,17 @@ def _short(target: machine.Machine) -> str:
     """Returns a machine's name, with a hash of its many features."""
     digest = hashlib.sha256(target.features.encode()).hexdigest()[:8]
     return f"{target.cpu}, {target.lanes} lanes, features {digest}"
+
+
+def check_variables() -> None:
+    """Raises ValueError for an environment variable of ours whose value means nothing here.
+
+    Made into a reason against machine code, it would have another engine play, without a word.
+    """
+    objects.is_described()
+    machine.asked_level()
+    if platform() == "cpu" and not unavailable():
+        machine.this_machine()
 
 
 def unavailable() -> str | None:

@@ -81,10 +81,12 @@ def choose(
       horizon: T, the time limit in steps, for machine code.
 
     Raises:
-      ValueError: the name is unknown, or the engine does not support the environment.
+      ValueError: the name is unknown, or the engine does not support the environment, or a variable
+        of ours has a value that means nothing.
     """
     start_time = time.perf_counter()
     check_name("engine", name, dict.fromkeys(ENGINES))
+    available.check_variables()
 
     def engine_in_c(task: Environment, reason: str) -> Engine:
         return Engine("mujoco", reason, _rollout_in_c(task), time.perf_counter() - start_time)
@@ -283,6 +285,7 @@ def map_function(
     Raises:
       ValueError: the name is unknown, or the engine does not support the function.
     """
+    available.check_variables()
     native_maker = functools.partial(machine_code, env, function, *examples)
     engine = MapEngine(*pick(name, native_maker, jax.vmap(function)))
     if engine.name == "vmap":

@@ -5,7 +5,6 @@ become one, which is kept and linked as any other.
 """
 
 import functools
-import os
 import shutil
 import tempfile
 from collections.abc import Iterable, Sequence
@@ -183,7 +182,7 @@ def _written(program: str, folder: Path) -> Path:
 
 def _options() -> tuple[str, ...]:
     """Returns the compiler's options for this machine."""
-    level = os.environ.get(machine.VARIABLE) or machine.HOST
+    level = machine.asked_level()
     return (*_OPTIONS, f"-march={'native' if level == machine.HOST else level}")
 
 

@@ -8,7 +8,12 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from mjx_reinforce.engine.scalar.nodes import Node, Scalar, is_constant
+from mjx_reinforce.engine.team.operations import LONG_FUNCTIONS
 
+#: Fewer scalars of one formula are computed one by one.
+MIN_RUN = 4
+#: A sum of fewer terms is not worth a meeting of the lanes.
+SHORT_SUM = 12
 #: Of more nodes no siblings are looked for: that takes long, and the start of an episode, which
 #: may have so many, is computed once.
 _MOST_NODES = 6_000
@@ -89,6 +94,37 @@ class Formulas:
                     most = saved
                     best = family
         return best
+
+    def repeated(
+        self, scalars: Iterable[Scalar], num_reads: Counter[Node], is_known: Callable[[Node], bool]
+    ) -> list[Node]:
+        """Returns scalars of one formula that would be computed anew wherever they are read.
+
+        Such are the units of a network's layer, which all units of the next layer read. Returns
+        what others are computed from first, and nothing where there is none.
+
+        Args:
+          scalars: what is to be computed.
+          num_reads: how often each node is read.
+          is_known: whether a node is computed.
+        """
+        num_terms: Counter[Node] = Counter()
+        costly = set()
+        families: dict[int, list[Node]] = {}
+        for node in sorted(ancestors(scalars, is_known), key=lambda node: node.index):
+            if node.op is None:
+                continue
+            inner = [x for x in node.args if isinstance(x, Node) and num_reads[x] == 1]
+            if node.op.name == "add" and node.dtype.kind == "f":
+                num_terms[node] = 2 + sum(num_terms[x] - 1 for x in inner if num_terms[x])
+            is_long = num_terms[node] >= SHORT_SUM or node.op.name in LONG_FUNCTIONS
+            if not is_long and costly.isdisjoint(inner):
+                continue
+            if num_reads[node] == 1:
+                costly.add(node)
+            else:
+                families.setdefault(self.number(node), []).append(node)
+        return next((x for x in families.values() if len(x) >= MIN_RUN), [])
 
     def forget(self) -> None:
         """Forgets which formula a node is, where it is in memory from now on or no longer."""

@@ -18,15 +18,18 @@ from mjx_reinforce.engine.scalar.nodes import Call, Node, Scalar, identity, is_c
 from mjx_reinforce.engine.scalar.passes import liveness
 from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop, Schedule
 from mjx_reinforce.engine.team.cpp import Cpp, qualifier
-from mjx_reinforce.engine.team.formulas import Formulas, Place, ancestors, sum_terms
+from mjx_reinforce.engine.team.formulas import (
+    MIN_RUN,
+    SHORT_SUM,
+    Formulas,
+    Place,
+    ancestors,
+    sum_terms,
+)
 from mjx_reinforce.engine.team.operations import expression, literal, type_of
 
-#: Fewer scalars of one formula are computed one by one.
-_MIN_RUN = 4
 #: Of a formula with so many operations, or more, the lanes compute any scalars together.
 _LONG = 24
-#: A sum of fewer terms is not worth a meeting of the lanes.
-_SHORT_SUM = 12
 
 
 class _Sum(NamedTuple):
@@ -109,6 +112,7 @@ class CText(Cpp):
     def get(self, scalar: Scalar) -> str:
         """Returns a scalar of the program."""
         self._prepare([scalar])
+        self._store_repeated([scalar])
         return self.value(scalar, self._values)
 
     def array(self, scalars: Sequence[Scalar]) -> str:
@@ -131,10 +135,11 @@ class CText(Cpp):
     def fill(self, array_id: str, scalars: Sequence[Scalar]) -> None:
         """Writes scalars of the program into an array."""
         self._prepare(scalars)
+        self._store_repeated(scalars)
         self._share(scalars)
         start = 0
         for run in self._runs(scalars):
-            if len(run) < _MIN_RUN:
+            if len(run) < MIN_RUN:
                 for k, x in enumerate(run, start=start):
                     self.line(f"if (t.lane == 0) {array_id}[{k}] = {self.value(x, self._values)};")
             else:
@@ -151,14 +156,27 @@ class CText(Cpp):
         One by one, as writing some changes what others are computed from.
         """
         while siblings := self._formulas.siblings(scalars, _LONG, self._is_apart):
-            array_id = self._reserve(siblings[0].dtype, len(siblings))
-            self._each(siblings, f"{array_id}[i] = {{}};")
-            self.line("t.sync();")
-            self._read_from(array_id, siblings)
+            self._store(siblings)
+
+    def _store_repeated(self, scalars: Sequence[Scalar]) -> None:
+        """Has the lanes compute once what would be computed anew wherever it is read."""
+        while repeated := self._formulas.repeated(scalars, self._uses, self._is_known):
+            self._store(repeated)
+
+    def _store(self, nodes: Sequence[Node]) -> None:
+        """Has the lanes compute nodes of one formula together, into a new array."""
+        array_id = self._reserve(nodes[0].dtype, len(nodes))
+        self._each(nodes, f"{array_id}[i] = {{}};")
+        self.line("t.sync();")
+        self._read_from(array_id, nodes)
+
+    def _is_known(self, node: Node) -> bool:
+        """Returns whether a node is computed already."""
+        return node in self._values or node in self._written
 
     def _is_apart(self, node: Node) -> bool:
         """Returns whether a node is computed already, or a sum that lanes share."""
-        return node in self._values or node in self._written or len(self._terms(node)) >= _SHORT_SUM
+        return self._is_known(node) or len(self._terms(node)) >= SHORT_SUM
 
     def leaf(self, node: Node) -> str:
         """An input is read where it is used."""
@@ -176,7 +194,7 @@ class CText(Cpp):
                 continue
             if node.op is None:
                 values[node] = self.leaf(node)
-            elif len(terms := self._terms(node)) >= _SHORT_SUM:
+            elif len(terms := self._terms(node)) >= SHORT_SUM:
                 values[node] = self._sum(_SUMS[node.op.name], node.dtype, terms, values)
             elif pending := [x for x in node.args if isinstance(x, Node) and x not in values]:
                 stack += [node, *pending]
@@ -430,7 +448,7 @@ class CText(Cpp):
         # all lanes alike.
         lone_terms = []
         for group in groups.values():
-            if len(group) < _MIN_RUN:
+            if len(group) < MIN_RUN:
                 lone_terms += group
             else:
                 self._each(group, f"{name} = {name} {kind.sign} {{}};")

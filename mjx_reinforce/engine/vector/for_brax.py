@@ -9,6 +9,7 @@ from brax.envs.base import Env, State, Wrapper
 
 from mjx_reinforce.engine.base import Box, Discrete, Environment
 from mjx_reinforce.engine.checks import check_key, check_name
+from mjx_reinforce.engine.contract import check_shape, in_words
 from mjx_reinforce.engine.vector.environment import VectorState, make_vec
 
 
@@ -50,11 +51,13 @@ class BraxVectorWrapper(Wrapper):
           rng: [N] keys, also as words [N, 2], or a key; consumed.
 
         Raises:
-          ValueError: it is no key, or one alone with autoreset "same_step".
+          ValueError: it is no key, keys of more axes, or one alone with autoreset "same_step".
         """
         check_key(rng)
         if not jnp.issubdtype(rng.dtype, jax.dtypes.prng_key):
             rng = jax.random.wrap_key_data(rng)
+        if rng.ndim > 1:
+            raise ValueError(f"the keys must be [] or [N], got {in_words(rng)}")
         # Wrappers of brax, which map one, would take our time limit for an end by the task.
         if rng.ndim == 0 and self.vec.autoreset == "same_step":
             raise ValueError(
@@ -75,12 +78,18 @@ class BraxVectorWrapper(Wrapper):
         Args:
           state: of ``reset`` or ``step``.
           action: [A] or [N, A]. An entry with bounds has them at -1 and 1; others are as they are.
+
+        Raises:
+          ValueError: the state is not of this environment, or the actions have another shape.
         """
 
         def play(state: VectorState, action: jax.Array) -> VectorState:
             return _single(self.vec.step(jax.tree.map(lambda x: x[None], state), action[None]))
 
-        before = cast(Any, state.pipeline_state)
+        before = getattr(state, "pipeline_state", None)
+        if not isinstance(before, VectorState):
+            raise ValueError(f"the state must be of reset or step, got {in_words(state)}")
+        check_shape("the actions", action, (*before.done.shape, self.vec.action_size))
         advance = jax.vmap(play) if before.done.ndim else play
         after = advance(before, _controls(cast(Box, self.vec.action_space), action))
         sums = {
@@ -98,8 +107,9 @@ def _single(state: VectorState) -> VectorState:
 def _controls(space: Box, action: jax.Array) -> jax.Array:
     """Returns actions [..., A] of a space, of what covers its bounds from -1 to 1."""
     is_bounded = np.isfinite(space.low) & np.isfinite(space.high)
-    low = jnp.asarray(np.where(is_bounded, space.low, -1), action.dtype)
-    high = jnp.asarray(np.where(is_bounded, space.high, 1), action.dtype)
+    dtype = jnp.result_type(action, float)
+    low = jnp.asarray(np.where(is_bounded, space.low, -1), dtype)
+    high = jnp.asarray(np.where(is_bounded, space.high, 1), dtype)
     return jnp.where(is_bounded, low + (action + 1) / 2 * (high - low), action)
 
 

@@ -58,26 +58,35 @@ class Sled(MujocoEnv):
         return forward, data.qpos[2] > 0.5, {"reward_forward": forward}
 
 
-def _episodes(name, env, *, seeds=2, num_episodes=5):
+def _episodes(name, env, *, act=None, seeds=2, num_episodes=5):
     """Returns the engine of a name, and episodes [S, T, N] of seeds by it."""
     family = mr.normal(env.action_space)
     policy = mr.mlp_policy(env.observation_size, family, (8, 8))
     actor = policy.init(jax.random.key(0))
-    engine = choice.choose(name, env, choice.ActingPolicy(policy.apply, actor, family), 20)
+    act = act or policy.apply
+    engine = choice.choose(name, env, choice.ActingPolicy(act, actor, family), 20)
 
     def play(key):
         options = {"num_episodes": num_episodes, "horizon": 20}
-        return engine.rollout(env, policy.apply, actor, family, key, **options)
+        return engine.rollout(env, act, actor, family, key, **options)
 
     return engine, jax.jit(jax.vmap(play))(jax.random.split(jax.random.key(1), seeds))
 
 
-def test_the_device_code_plays_as_c_does():
+def _own_act(actor, observation):
+    """A network that is none of ours, of units that all units of the next layer read."""
+    mix = jnp.sin(jnp.arange(15 * 16.0)).reshape(15, 16)
+    units = jnp.tanh(observation @ mix)
+    return 0.1 * jnp.tanh(units @ mix.T) @ mix[:, :2]
+
+
+@pytest.mark.parametrize("act", [None, _own_act])
+def test_the_device_code_plays_as_c_does(act):
     env = Sled()
-    engine, episodes = _episodes("auto", env)
+    engine, episodes = _episodes("auto", env, act=act)
     assert engine.name == "native"
     assert "C++ compiler" in engine.why
-    _, expected = _episodes("mujoco", env)
+    _, expected = _episodes("mujoco", env, act=act)
     assert episodes.observation.shape == expected.observation.shape
     np.testing.assert_array_equal(episodes.mask, expected.mask)
     np.testing.assert_allclose(episodes.action, expected.action, atol=2e-3)

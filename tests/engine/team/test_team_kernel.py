@@ -1,5 +1,6 @@
 """Kernels for teams of lanes, compiled with one lane for this CPU, beside its machine code."""
 
+import itertools
 import re
 
 import gpu_on_cpu
@@ -354,6 +355,28 @@ def test_lanes_share_what_few_numbers_cost():
         physics = team_kernel.Physics("", far=0, skip=1, lanes=16, shared=0)
         texts.append(team_kernel.mapping_text(written, physics).text)
     assert [text.count("tanhf(") for text in texts] == [30, 30]
+
+
+def own_network(layers, x):
+    """A network as a user writes it: no operation of ours, and so no layer of the device code."""
+    for weights, bias in layers[:-1]:
+        x = jnp.tanh(x @ weights + bias)
+    return x @ layers[-1][0] + layers[-1][1]
+
+
+@pytest.mark.parametrize("num_inputs", [3, 15])
+def test_units_of_an_own_network_are_computed_once(num_inputs):
+    """By the lanes together, however many units of the next layer read them."""
+    sizes = (num_inputs, 16, 20, 2)
+    layers = [(jnp.zeros(pair), jnp.zeros(pair[1])) for pair in itertools.pairwise(sizes)]
+    traced = scalarized.trace(own_network, layers, jnp.zeros(num_inputs))
+    written = scalarized.build(*traced, program.BRANCH_COST, program.SCANS)
+    physics = team_kernel.Physics("", far=0, skip=1, lanes=16, shared=0)
+    text = team_kernel.mapping_text(written, physics).text
+    loops = re.findall(r"EACH\(i, (\d+)\) \{([^}]*)\}", text)
+    calls = [int(rounds) * body.count("tanhf(") for rounds, body in loops if "tanhf(" in body]
+    assert calls == [16, 20]
+    assert text.count("tanhf(") == 2  # none is outside of these loops
 
 
 def test_a_table_with_infinity_is_not_static():

@@ -143,6 +143,39 @@ def test_what_is_no_key():
         envs.for_brax(Drifting(SPACE)).reset(3)
 
 
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        (jnp.zeros((3, 1)), r"must be \[5, 1\], got the shape \[3, 1\]"),
+        (jnp.zeros(5), r"must be \[5, 1\], got the shape \[5\]"),
+        (jnp.zeros((5, 2)), r"must be \[5, 1\], got the shape \[5, 2\]"),
+        ([[0.0]] * 5, r"must be \[5, 1\], got a list"),
+    ],
+)
+def test_wrong_actions(played, actions, message):
+    """A short line, which names our arguments and no function within."""
+    env, *_ = played
+    with pytest.raises(ValueError, match=message) as raised:
+        env.step(env.reset(KEYS), actions)
+    assert len(str(raised.value)) < 80
+
+
+def test_wrong_states_and_keys(played):
+    env, *_ = played
+    with pytest.raises(ValueError, match="must be of reset or step, got None"):
+        env.step(None, ACTIONS[0])
+    with pytest.raises(ValueError, match=r"the keys must be \[\] or \[N\], got the shape \[1, 5\]"):
+        env.reset(KEYS[None])
+
+
+def test_integer_actions_reach_bounds_that_are_none():
+    """The bounds are not rounded to the type of the actions."""
+    env = envs.for_brax(Drifting(Box(np.array([-0.5]), np.array([0.5]))), autoreset="disabled")
+    state = env.reset(KEYS[0])
+    ones = jnp.ones(1)
+    np.testing.assert_array_equal(env.step(state, ones.astype(int)).obs, env.step(state, ones).obs)
+
+
 @pytest.mark.slow
 def test_brax_sees_the_environments_as_its_wrappers_show_them():
     """The same starts and actions: its rewards, ends and observations, until an episode ends."""
