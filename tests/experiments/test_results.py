@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from experiments.studies.results import __main__ as results
-from experiments.studies.results import kept, runs, tables
+from experiments.studies.results import kept, listing, runs, tables
 from experiments.studies.results.tasks import TASKS, settings_of
-from mjx_reinforce.files import write_json
+from mjx_reinforce.files import read_json, write_json
 from mjx_reinforce.runs import command_line
 from mjx_reinforce.settings.config import check
 
@@ -75,6 +75,34 @@ def test_what_is_kept_of_a_task_and_machine_is_replaced(folder):
     gpu, cpu = kept.clock(folder / "kept")
     np.testing.assert_array_equal(gpu.final, [3])
     np.testing.assert_array_equal(cpu.final, [6.5, 9])
+
+
+def test_races_are_kept_and_listed_as_such(folder):
+    """Their rows stand beside those of independent seeds, and replace none."""
+    write_run(folder / "more" / "race", GPU | {"race": 4}, [0.0, 50.0], [[0], [2]], test=[3.0])
+    kept.gather_clock(folder / "more", folder / "kept")
+    gpu, cpu, race = kept.clock(folder / "kept")
+    assert (gpu.task, cpu.task, race.task) == ("Hopper-v5",) * 2 + (
+        "Hopper-v5, best of races of 4",
+    )
+    np.testing.assert_array_equal([*gpu.final, *race.final], [11, 21, 3])
+
+
+def test_the_list_of_runs(folder):
+    said = {"final_returns": [10.0, 20.0], "env_steps": [100, 300]}
+    for place, race, tested in (("a", 4, [12.0, 24.0]), ("b/c", 1, None)):
+        write_run(folder / "list" / place, GPU | {"race": race}, [0.0], [[0, 0]], test=tested)
+        path = folder / "list" / place / "summary.json"
+        write_json(path, read_json(path) | said)
+    first, second = (x.split(" | ") for x in listing.of_runs(folder / "list").splitlines()[2:])
+    assert first[:5] == ["| a", "Hopper-v5, best of races of 4", "2", "7", "finished"]
+    assert first[6:10] == ["12.0", "24.0", "15.0, 10.0", "10.0 min"]
+    assert first[11] == "200"
+    # Not tested: the last evaluation.
+    assert second[:5] == ["| b/c", "Hopper-v5", "2", "7", "finished, not tested"]
+    assert second[6:8] == ["10.0", "20.0"]
+    with pytest.raises(ValueError, match="has no run"):
+        listing.of_runs(folder / "kept")
 
 
 def test_the_tables_of_both_pages(folder):

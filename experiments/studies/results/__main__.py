@@ -7,6 +7,7 @@ and what was stopped (Ctrl-C, or ``timeout -s INT 570 python ...``) goes on.
     python -m experiments.studies.results play DIR         # DIR/play/TASK.csv, docs/films
     python -m experiments.studies.results keep DIR         # data, of the runs of train
     python -m experiments.studies.results seconds DIR      # data, of runs that were given a time
+    python -m experiments.studies.results runs DIR         # prints a table of all runs there
     python -m experiments.studies.results page             # the tables and the picture, from data
     python -m experiments.studies.results pretrained DIR   # the package's policies, of all runs
     python -m experiments.studies.results films            # docs/films, of the package's policies
@@ -34,7 +35,7 @@ def main() -> None:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    stages = ("train", "play", "keep", "seconds", "page", "pretrained", "films")
+    stages = ("train", "play", "keep", "seconds", "runs", "page", "pretrained", "films")
     parser.add_argument("stage", choices=stages)
     parser.add_argument("directory", type=Path, nargs="?", help="of all stages but page and films")
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
@@ -69,6 +70,10 @@ def _do(arguments: argparse.Namespace) -> int:
             from experiments.studies.results import kept
 
             print(*kept.gather_clock(directory, DATA), sep="\n")
+        case "runs":
+            from experiments.studies.results import listing
+
+            print(listing.of_runs(directory))
         case "page":
             write(DATA, DOCS, ROOT / "README.md")
         case "pretrained":
@@ -95,6 +100,7 @@ def write(data: Path, docs: Path, readme: Path) -> None:
         "play": partial(tables.play, kept.played(data), docs),
         "tasks": partial(tables.of_tasks, results),
         "pendulum": partial(tables.pendulum, pendulum),
+        "optimum": partial(tables.distances, kept.optimum(data)),
         "results": partial(tables.readme, groups, docs),
     }
     for page in (docs / "results.md", readme):

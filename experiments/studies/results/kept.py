@@ -29,6 +29,7 @@ POLICIES = ("best", "median")
 MINUTE = 60.0
 _POINTS = 40
 _SEEDS, _CURVES, _PLAYED = "seconds.csv", "seconds-curves.csv", "seconds-play-"
+_OPTIMUM = "optimum.csv"
 _COLUMNS = ("task", "device", "root", "seed", "status", "commit", "minute", "final", "best")
 _COLUMNS += ("seconds", "env_steps", "compile_seconds")
 _CURVE = ("seconds", "mean", "low", "high")
@@ -136,7 +137,7 @@ def gather_clock(directory: Path, folder: Path) -> list[str]:
         if len(times) < 2:
             continue
         known = {
-            "task": config["env"],
+            "task": _task(config),
             "device": _device(config),
             "root": config["seed"],
             "status": summary["status"],
@@ -157,6 +158,12 @@ def gather_clock(directory: Path, folder: Path) -> list[str]:
     for path in directory.glob("play/*.csv"):
         shutil.copyfile(path, folder / f"{_PLAYED}{path.name}")
     return [f"{task} on {device}: {len(found)} runs" for (task, device), found in returns.items()]
+
+
+def _task(config: dict[str, Any]) -> str:
+    """Returns the task of a run, with how its policies were chosen, if they were."""
+    race = config.get("race", 1)
+    return config["env"] if race == 1 else f"{config['env']}, best of races of {race}"
 
 
 def _device(config: dict[str, Any]) -> str:
@@ -210,6 +217,11 @@ def clock(folder: Path) -> list[Group]:
         of_time = float(np.median(seconds))
         groups.append(Group(task, device, minute, final, of_time, steps.mean(), not finished.all()))
     return groups
+
+
+def optimum(folder: Path) -> list[dict[str, str]]:
+    """Returns what is kept of searches for the optimum, a row for each start."""
+    return _read(folder / _OPTIMUM)
 
 
 def curves(folder: Path) -> dict[tuple[str, str], Columns]:
