@@ -11,7 +11,7 @@ from mjx_reinforce.engine.play import available, c_mujoco
 _LEAST_DOFS = 14
 #: Models of so many degrees of freedom, or more, are played by 32 lanes.
 _WIDE_DOFS = 16
-#: Models of so many, or fewer, are played by 8 lanes, others by 16.
+#: Models of so many, or fewer, are played by 8 lanes where teams are faster than threads.
 _NARROW_DOFS = 8
 #: With more possible contacts, eight lanes play a narrow model faster where its file allows few
 #: iterations: where too many touch for a thread, it searches with the rows of all.
@@ -90,7 +90,7 @@ def team_physics(model: PhysicsModel) -> Physics:
 def _lanes(model: PhysicsModel) -> int:
     """Returns how many lanes play an episode."""
     num_dofs = model.mj_model.nv
-    if num_dofs <= _NARROW_DOFS:
+    if num_dofs <= _NARROW_DOFS and _is_for_teams(model.mj_model):
         return 8
     return 32 if num_dofs >= _WIDE_DOFS else 16
 
