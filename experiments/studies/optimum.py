@@ -127,8 +127,8 @@ def _games(task: str, num_knots: int, num_episodes: int) -> Callable[[int], Retu
     def play(start: Any, corrections: jax.Array, share: jax.Array) -> jax.Array:
         added = jnp.einsum("tk,nka->tna", weights, corrections) * (high - low) / 2
 
-        def step(state: tuple[Any, jax.Array], added: jax.Array) -> tuple[Any, jax.Array]:
-            state, is_over = state
+        def step(carry: tuple[Any, jax.Array], added: jax.Array) -> tuple[Any, jax.Array]:
+            state, is_over = carry
             mode = player.policy.distribution.mode(act(player.policy, player.actor, state.obs))
             state = vec.step(state, jnp.clip(share * mode + added, low, high))
             return (state, is_over | state.done), jnp.where(is_over, 0.0, state.reward)
