@@ -11,7 +11,7 @@ from mjx_reinforce.engine.play import available, c_mujoco
 _LEAST_DOFS = 14
 #: Models of so many degrees of freedom, or more, are played by 32 lanes.
 _WIDE_DOFS = 16
-#: Models of so many, or fewer, are played by 8 lanes where teams are faster than threads.
+#: Models of so many, or fewer, may be played by 8 lanes.
 _NARROW_DOFS = 8
 #: With more possible contacts, eight lanes play a narrow model faster where its file allows few
 #: iterations: where too many touch for a thread, it searches with the rows of all.
@@ -35,13 +35,16 @@ def why_not(env: Any) -> str | None:
 
 def _is_for_teams(model: MjModel) -> bool:
     """Returns whether teams play a model faster than threads."""
-    if model.nv >= _LEAST_DOFS:
-        return True
+    return model.nv >= _LEAST_DOFS or _is_narrow(model)
+
+
+def _is_narrow(model: MjModel) -> bool:
+    """Returns whether eight lanes play a model faster than a thread or sixteen."""
     from mjx_reinforce.engine.physics.early_stop import stops_early
     from mjx_reinforce.engine.team import supported
 
-    is_narrow = model.nv <= _NARROW_DOFS
-    return is_narrow and stops_early(model) and supported.num_parts(model) > _CONTACTS_OF_THREAD
+    is_small = model.nv <= _NARROW_DOFS
+    return is_small and stops_early(model) and supported.num_parts(model) > _CONTACTS_OF_THREAD
 
 
 def played_by(env: Any) -> str:
@@ -89,10 +92,9 @@ def team_physics(model: PhysicsModel) -> Physics:
 
 def _lanes(model: PhysicsModel) -> int:
     """Returns how many lanes play an episode."""
-    num_dofs = model.mj_model.nv
-    if num_dofs <= _NARROW_DOFS and _is_for_teams(model.mj_model):
+    if _is_narrow(model.mj_model):
         return 8
-    return 32 if num_dofs >= _WIDE_DOFS else 16
+    return 32 if model.mj_model.nv >= _WIDE_DOFS else 16
 
 
 def _shared_memory() -> int:
