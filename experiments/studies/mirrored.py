@@ -80,16 +80,16 @@ def branch_returns(task: str, player: Any, seed: int) -> np.ndarray:
         moments = jax.random.randint(moment_key, (_NUM_STATES,), 0, _LAST_BRANCH)
 
         def step(carry: Any, noise_of: tuple[jax.Array, jax.Array]) -> Any:
-            state, kept = carry
+            state, has_branched = carry
             number, key = noise_of
             noise = jax.random.normal(key, (_NUM_STATES, size))
             # An episode that ends earlier branches in its last state before that.
-            is_before = (number < moments) & ~kept
+            is_before = (number < moments) & ~has_branched
             new_state = play(state, _spread(noise, shape))
-            held = is_before & ~new_state.done.reshape(shape)[:, 0, 0]
-            mask = jnp.broadcast_to(held[:, None, None], shape).reshape(-1)
+            goes_on = is_before & ~new_state.done.reshape(shape)[:, 0, 0]
+            mask = jnp.broadcast_to(goes_on[:, None, None], shape).reshape(-1)
             state = _where(mask, new_state, state)
-            return (state, kept | ~held), None
+            return (state, has_branched | ~goes_on), None
 
         keys = jax.random.split(start_key, _NUM_STATES)
         start = vec.reset(_spread(keys, shape))

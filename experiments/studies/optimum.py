@@ -35,7 +35,7 @@ from mjx_reinforce import envs, load, make_vec
 from mjx_reinforce.learning.policy import act
 
 _FILE = Path(__file__).parent / "results" / "data" / "optimum.csv"
-_COLUMNS = ("task", "method", "start", "policy", "found", "second_half", "rest", "rounds")
+_COLUMNS = ("task", "method", "start", "policy", "best", "second_half", "best_from_rest", "rounds")
 _COLUMNS += ("episodes", "knots", "commit", "machine")
 _TASKS = tuple(x for x in envs.names() if x.endswith("-v5"))
 #: Tasks whose reward no state exceeds that of the model's own pose at rest.
@@ -71,17 +71,19 @@ def main() -> None:
     for task in arguments.tasks:
         known = [x for x in _known() if x["task"] == task]
         starts = sorted({*range(arguments.starts)} - {int(x["start"]) for x in known})
-        for row in _found(task, starts, arguments.rounds, arguments.episodes):
+        for row in _start_rows(task, starts, arguments.rounds, arguments.episodes):
             rows.append(_FILE, [rows.rounded(row | origin, 9)], _COLUMNS)
             print(row, flush=True)
     print(tables.distances(_known()))
 
 
 def _known() -> list[dict[str, Any]]:
-    return rows.read(_FILE) if (_FILE).exists() else []
+    return rows.read(_FILE) if _FILE.exists() else []
 
 
-def _found(task: str, starts: list[int], rounds: int, episodes: int) -> Iterator[dict[str, Any]]:
+def _start_rows(
+    task: str, starts: list[int], rounds: int, episodes: int
+) -> Iterator[dict[str, Any]]:
     """Yields a row for each start; ``episodes`` is N."""
     bound = upright_return(task) if task in _PENDULUMS else None
     env = envs.make(task)
@@ -95,14 +97,14 @@ def _found(task: str, starts: list[int], rounds: int, episodes: int) -> Iterator
         row |= {"episodes": episodes, "knots": num_knots}
         if bound is not None:
             row |= {"method": "bound", "rounds": 0, "second_half": 0.0}
-            yield row | {"found": bound, "rest": bound}
+            yield row | {"best": bound, "best_from_rest": bound}
             continue
         # With the policy, and from rest without it.
         searches = [functools.partial(returns, share=share) for share in (1.0, 0.0)]
         bests = [search(score, nothing, rounds, episodes) for score in searches]
         best = max(bests, key=lambda x: x[-1])
-        row |= {"method": "search", "found": best[-1], "second_half": best[-1] - best[rounds // 2]}
-        yield row | {"rest": bests[1][-1], "rounds": rounds}
+        row |= {"method": "search", "best": best[-1], "second_half": best[-1] - best[rounds // 2]}
+        yield row | {"best_from_rest": bests[1][-1], "rounds": rounds}
 
 
 def upright_return(task: str) -> float:

@@ -39,12 +39,12 @@ def test_a_search_scores_where_it_begins():
 def test_the_table_says_on_which_side_the_optimum_is():
     kinds = {"second_half": "0"}
     searched = {"task": "A-v5", "method": "search", "second_half": "0.25"}
-    found = [
-        searched | {"policy": "-4", "found": "-3"},
-        searched | {"policy": "-5", "found": "-2"},
-        kinds | {"task": "B-v5", "method": "bound", "policy": "8", "found": "9"},
+    lines = [
+        searched | {"policy": "-4", "best": "-3"},
+        searched | {"policy": "-5", "best": "-2"},
+        kinds | {"task": "B-v5", "method": "bound", "policy": "8", "best": "9"},
     ]
-    a, b = (line.split(" | ") for line in tables.distances(found).splitlines()[2:])
+    a, b = (line.split(" | ") for line in tables.distances(lines).splitlines()[2:])
     assert a[:3] == ["| A-v5", "2", "-4.50"]
     assert a[3] == "at least -2.50"
     assert a[4].startswith("at least 2.00 (")

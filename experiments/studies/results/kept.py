@@ -137,7 +137,7 @@ def gather_clock(directory: Path, folder: Path) -> list[str]:
         if len(times) < 2:
             continue
         known = {
-            "task": _task(config),
+            "task": task_name(config),
             "device": _device(config),
             "root": config["seed"],
             "status": summary["status"],
@@ -160,7 +160,7 @@ def gather_clock(directory: Path, folder: Path) -> list[str]:
     return [f"{task} on {device}: {len(found)} runs" for (task, device), found in returns.items()]
 
 
-def _task(config: dict[str, Any]) -> str:
+def task_name(config: dict[str, Any]) -> str:
     """Returns the task of a run, with how its policies were chosen, if they were."""
     race = config.get("race", 1)
     return config["env"] if race == 1 else f"{config['env']}, best of races of {race}"

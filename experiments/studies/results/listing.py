@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.kit.markdown import table
+from experiments.studies.results.kept import task_name
 from experiments.studies.results.tables import estimate, number, seconds
 from mjx_reinforce.files import read_json
 from mjx_reinforce.statistics import estimate_mean, worst_if_not_finite
@@ -37,10 +38,9 @@ def _lines(directory: Path) -> Iterator[list[str]]:
         status = summary["status"]
         if "final_test_returns" not in summary:
             status += ", not tested"
-        race = config["race"]
         yield [
             str(run.relative_to(directory)),
-            config["env"] if race == 1 else f"{config['env']}, best of races of {race}",
+            task_name(config),
             str(len(tested)),
             str(config["seed"]),
             status,

@@ -71,26 +71,26 @@ def _result_row(result: Result) -> list[str]:
     ]
 
 
-def distances(found: Sequence[Mapping[str, str]]) -> str:
+def distances(starts: Sequence[Mapping[str, str]]) -> str:
     """Returns the table of the distances to the optimum, from the rows of optimum.csv."""
-    tasks = dict.fromkeys(row["task"] for row in found)
+    tasks = dict.fromkeys(row["task"] for row in starts)
     header = ["task", "starts", "policy", "optimum", "distance: mean (95%)", "median", "largest"]
     header += ["found in the second half of the search: mean, largest"]
-    return table(header, (_distance_row([x for x in found if x["task"] == y]) for y in tasks))
+    return table(header, (_distance_row([x for x in starts if x["task"] == y]) for y in tasks))
 
 
-def _distance_row(mine: Sequence[Mapping[str, str]]) -> list[str]:
+def _distance_row(starts: Sequence[Mapping[str, str]]) -> list[str]:
     """Returns the row of a task, whose starts have a bound or what a search found."""
     policy, best, late = (
-        np.array([float(row[name]) for row in mine]) for name in ("policy", "found", "second_half")
+        np.array([float(row[name]) for row in starts]) for name in ("policy", "best", "second_half")
     )
     distance = best - policy
     side, searched = "at least", f"{number(late.mean())}, {number(late.max())}"
-    if mine[0]["method"] == "bound":
+    if starts[0]["method"] == "bound":
         side, searched = "at most", "a bound, no search"
     return [
-        mine[0]["task"],
-        str(len(mine)),
+        starts[0]["task"],
+        str(len(starts)),
         number(policy.mean()),
         f"{side} {number(best.mean())}",
         f"{side} {estimate(estimate_mean(distance))}",

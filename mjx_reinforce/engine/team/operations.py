@@ -29,20 +29,9 @@ _LIMITS = {"int8": (-128, 127), "uint8": (0, 255)}
 _LITERAL_FORMS = {"float": ("f", "unsigned"), "double": ("", "unsigned long long")}
 #: Functions of floats that take many instructions, and have their own names in the C library.
 _LONG = (
-    "cbrt",
-    "exp",
-    "exp2",
-    "expm1",
-    "log",
-    "log1p",
-    "sin",
-    "cos",
-    "tan",
-    "sinh",
-    "cosh",
-    "tanh",
+    *("cbrt", "exp", "exp2", "expm1", "log", "log1p", "sin", "cos", "tan", "sinh", "cosh", "tanh"),
+    *("asin", "acos", "atan", "atan2", "asinh", "acosh", "atanh", "erf", "erfc", "pow"),
 )
-_LONG += ("asin", "acos", "atan", "atan2", "asinh", "acosh", "atanh", "erf", "erfc", "pow")
 #: All that take many instructions.
 LONG_FUNCTIONS = frozenset((*_LONG, "erf_inv", "logistic"))
 #: Functions of floats that the C library and CUDA have under these names, with an f for float32.

@@ -326,8 +326,15 @@ def _close(
     is_skippable: bool = False,
 ) -> list[Scalar]:
     """Gives a branch its place; returns its results."""
-    gate = Gate(graph.scope, graph.number(), flag, body.scope, hot_values, cold_values)
-    gate.is_skippable = is_skippable
+    gate = Gate(
+        graph.scope,
+        graph.number(),
+        flag,
+        body.scope,
+        hot_values,
+        cold_values,
+        is_skippable=is_skippable,
+    )
     for position, (hot, cold) in enumerate(zip(hot_values, cold_values, strict=True)):
         varying = any(isinstance(value, Node) and value.varying for value in (hot, cold))
         leaf = None
