@@ -44,12 +44,12 @@ def dog(tmp_path_factory):
 
 @pytest.mark.slow
 def test_the_commands_of_the_class_train_and_export(dog, tmp_path):
-    """Two updates of the preset, in place of minutes."""
+    """Two updates of the preset, in place of minutes, by the engine that compiles nothing."""
     words = dog.__doc__.replace("--minutes 20", "").partition("python ")[2].partition("\n\n")[0]
     train, watch, export = (command.split() for command in words.split("python "))
     assert watch == ["-m", "mjx_reinforce.watch", "my_dog_run", "--env", "my_dog:MyDog"]
     short = "--max-updates 2 --env-steps None --num-seeds 1 --num-episodes 8 --train-horizon 10"
-    short += " --value-batch-size 8 --horizon 20 --eval-every 1 --eval-episodes 2"
+    short += " --value-batch-size 8 --horizon 20 --eval-every 1 --eval-episodes 2 --engine mujoco"
     for command in ([*train, *short.split()], export):
         subprocess.run([sys.executable, *command], check=True, cwd=Path(dog.__file__).parent)
     run = Path(dog.__file__).with_name("my_dog_run")
