@@ -31,31 +31,42 @@ def write_episodes(folder, task, ours, theirs):
 def test_a_page_is_made_of_what_is_kept(tmp_path):
     data = tmp_path / "data"
     data.mkdir()
-    (data / "published.csv").write_bytes((study.DATA / "published.csv").read_bytes())
+    for name in (tables.PUBLISHED, tables.PUBLISHED_SECONDS):
+        (data / name).write_bytes((study.DATA / name).read_bytes())
     page = tmp_path / "page.md"
     marks = "<!-- not run: a comment -->\n"  # that has no end
-    marks += "<!-- returns -->\n<!-- end -->\n<!-- agreement -->\n<!-- end -->\n"
+    for mark in ("returns", "after a minute", "agreement"):
+        marks += f"<!-- {mark} -->\n<!-- end -->\n"
     page.write_text(marks)
     write_run(tmp_path / "one", "HopperHop", 1, [10.0, 20.0, 30.0, 40.0, 50.0, 60.0])
     write_run(tmp_path / "one", "WalkerRun", 1, [700.0] * 8)
     write_run(tmp_path / "one", "WalkerRun", 8, [800.0] * 8)
+    write_run(tmp_path / "one", "PointMass", 1, [900.0] * 8)
     write_episodes(tmp_path / "one", "WalkerRun", [1.0, 2.0, 3.0], [2.0, 3.0, 4.0])
     study.keep(tmp_path / "one", data)
     study.write(data, page)
     lines = page.read_text().splitlines()
-    walker, _, hopper = (x for x in lines if x.startswith(("| WalkerRun |", "| HopperHop |")))
+    of_returns, _, of_minutes = page.read_text().partition("| task | here, a minute |")
+    walker, _, hopper = (
+        x for x in of_returns.splitlines() if x.startswith(("| WalkerRun |", "| HopperHop |"))
+    )
     assert "| X | 1 | 700.0 (no interval) | 700.0 | 58 | 2.5e6 | 470 | 601 | 711 |" in walker
     assert "| 1 | 35.0 (" in hopper
     assert hopper.endswith("| 10.0 | 58 | 2.5e6 | 2 | 2 | 122 | 61 | 188 |")
-    # Means are over the tasks that have a figure: of REPPO (896 + 188) / 2.
-    assert "| mean of 2 tasks |  | 1 | 367.5 |  |  |  | 236 | 302 | 416 | 446 | 542 |" in lines
+    # Means are over the tasks that have all figures. PointMass has none of REPPO.
+    means = "| mean of the 2 tasks that all have |  | 1 | 367.5 |  |  |  | 236 | 302 | 416 |"
+    assert f"{means} 446 | 542 |" in lines
+    # 900 of 894, 700 of 531, 35 of 8: the task that is most behind stands first.
+    places = [of_minutes.index(f"| {task} |") for task in ("PointMass", "WalkerRun", "HopperHop")]
+    assert places == sorted(places)
+    assert "| PointMass | 900.0 (no interval) |  | 894 | 883 |" in lines
     assert any(x.startswith("| WalkerRun (seed 3) | 3 | 2.00 | 3.00 | 1.00 (") for x in lines)
     # A run that is kept again replaces what is there.
     write_run(tmp_path / "two", "HopperHop", 1, [1.0] * 8)
     study.keep(tmp_path / "two", data)
     study.write(data, page)
-    assert sum(x.startswith("| HopperHop |") for x in page.read_text().splitlines()) == 1
-    assert len(tables.results(data)) == 3
+    assert sum(x.startswith("| HopperHop | X |") for x in page.read_text().splitlines()) == 1
+    assert len(tables.results(data)) == 4
 
 
 def test_every_task_has_published_figures():

@@ -88,6 +88,7 @@ def write(data: Path, page: Path) -> None:
 
     texts = {
         "returns": partial(tables.returns, data),
+        "after a minute": partial(tables.after_a_minute, data),
         "agreement": partial(tables.agreement, data),
         "speeds": partial(tables.speeds, data),
     }

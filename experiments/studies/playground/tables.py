@@ -15,6 +15,8 @@ from experiments.studies.results.tables import compare, estimate, number
 from mjx_reinforce.statistics import estimate_mean
 
 RETURNS, AGREEMENT, PUBLISHED = "returns.csv", "agreement.csv", "published.csv"
+#: Published means after so many seconds of training.
+PUBLISHED_SECONDS = "published_seconds.csv"
 #: Rows of ``experiments.speed.benchmark gpu --tasks playground:...``.
 SPEEDS = "speeds.csv"
 _RIVALS = ("Playground, MJX", "Playground, MJX-Warp")
@@ -69,7 +71,7 @@ def _published(data: Path) -> dict[str, dict[str, float]]:
 
 
 def returns(data: Path) -> str:
-    """Returns the table of all tasks, with a last row of means."""
+    """Returns the table of all tasks, with a last row of means over those of every column."""
     published = _published(data)
     measured = results(data)
     header = ["task", "on", "minutes", "mean (95%)", "worst seed", "seconds", "env steps a seed"]
@@ -87,17 +89,47 @@ def returns(data: Path) -> str:
         for result in measured
     ]
     for minutes in sorted({result.minutes for result in measured}):
-        same_budget = [result for result in measured if result.minutes == minutes]
-        mean = float(np.mean([result.returns.mean() for result in same_budget]))
+        common = [
+            result
+            for result in measured
+            if result.minutes == minutes
+            and all(result.task in column for column in published.values())
+        ]
+        if not common:
+            continue
+        mean = float(np.mean([result.returns.mean() for result in common]))
         means = [
-            float(np.mean([column[x.task] for x in same_budget if x.task in column] or [np.nan]))
+            float(np.mean([column[result.task] for result in common]))
             for column in published.values()
         ]
-        label = f"mean of {len(same_budget)} tasks"
+        label = f"mean of the {len(common)} tasks that all have"
         lines.append(
             [label, "", f"{minutes:g}", number(mean), "", "", "", *(fixed(x, 0) for x in means)]
         )
     return table([*header, *published], lines)
+
+
+def after_a_minute(data: Path) -> str:
+    """Returns the table of returns after a minute beside published ones, the most lost first."""
+    published: dict[str, dict[str, float]] = {}
+    for row in sorted(read(data / PUBLISHED_SECONDS), key=lambda row: row["algorithm"]):
+        label = f"{row['algorithm']}, {float(row['seconds']):.0f} s"
+        published.setdefault(label, {})[row["task"]] = float(row["mean"])
+
+    def best(task: str) -> float:
+        return max(column[task] for column in published.values() if task in column)
+
+    minute = [result for result in results(data) if result.minutes == 1]
+    minute.sort(key=lambda result: result.returns.mean() / best(result.task))
+    lines = [
+        [
+            result.task,
+            estimate(estimate_mean(result.returns)),
+            *(_cell(column.get(result.task)) for column in published.values()),
+        ]
+        for result in minute
+    ]
+    return table(["task", "here, a minute", *published], lines)
 
 
 def _cell(mean: float | None) -> str:
