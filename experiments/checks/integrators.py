@@ -11,6 +11,7 @@ of a position or velocity, and the median over starts of each start's largest di
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -28,7 +29,8 @@ def states_after_a_step(task: str) -> np.ndarray:
         env.reset(seed=seed)
         env.action_space.seed(seed)
         env.step(env.action_space.sample())
-        data = env.unwrapped.data
+        simulation: Any = env.unwrapped
+        data = simulation.data
         states.append(np.concatenate([data.qpos, data.qvel]))
     return np.array(states)
 
@@ -44,7 +46,8 @@ def main() -> None:
     if len(arguments.files) != {"write": 1, "compare": 2}[arguments.stage]:
         parser.error(f"{arguments.stage} takes another number of files; see --help")
     if arguments.stage == "write":
-        np.savez(arguments.files[0], **{task: states_after_a_step(task) for task in TASKS})
+        states = {task: states_after_a_step(task) for task in TASKS}
+        np.savez(arguments.files[0], allow_pickle=False, **states)
         return
     old, new = map(np.load, arguments.files)
     for task in TASKS:
