@@ -31,8 +31,8 @@ TASKS = {f"envs.{name}": getattr(envs, name) for name in TASK_NAMES}
 PARTS = {f"envs.parts.{name}": getattr(parts, name) for name in parts.__all__}
 #: Comment before a block that no test runs, with the reason.
 NOT_RUN = "<!-- not run: "
-#: Examples of docstrings that train for seconds.
-LONG_EXAMPLES = {"Cut", "Evaluation", "SweepResults"}
+#: Examples of docstrings that compile or train for seconds.
+LONG_EXAMPLES = {"Cut", "Evaluation", "RunResults", "SweepResults", "envs.for_brax", "sweep"}
 
 
 def page(name):

@@ -36,17 +36,23 @@ FOLDERS = ("envs", "experiments", "mjx_reinforce", "tests")
 
 
 @functools.cache
+def tokens(path):
+    """Returns the names, strings and comments of a file of Python."""
+    kinds = tokenize.NAME, tokenize.STRING, tokenize.COMMENT
+    text = io.StringIO(path.read_text("utf-8"))
+    return [token for token in tokenize.generate_tokens(text.readline) if token.type in kinds]
+
+
+@functools.cache
 def names(path):
     """Returns the names in the code of a file: those of Python, and the strings of one word."""
     text = path.read_text("utf-8")
     if path.suffix in (".h", ".ll"):
         return set(re.findall(r"\w+", text))
-    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
-    words = {token.string for token in tokens if token.type == tokenize.NAME}
+    words = {token.string for token in tokens(path) if token.type == tokenize.NAME}
     for node in ast.walk(ast.parse(text)):
-        value = getattr(node, "value", None)
-        if isinstance(node, ast.Constant) and re.fullmatch(r"[\w.:/-]+", str(value)):
-            words.update(re.split(r"\W+", str(value)))
+        if isinstance(node, ast.Constant) and re.fullmatch(r"[\w.:/-]+", str(node.value)):
+            words.update(re.split(r"\W+", str(node.value)))
     return words
 
 
@@ -61,13 +67,12 @@ def definitions(path, kind):
 
 def prose(path):
     """Yields what stands in double backticks in a Python file or a page, and the line before it."""
-    text = path.read_text("utf-8")
     if path.suffix == ".md":
-        for line, words in enumerate(text.splitlines(), start=1):
+        for line, words in enumerate(path.read_text("utf-8").splitlines(), start=1):
             yield from ((line, code) for code in re.findall("(?<!`)``([^`]+)``(?!`)", words))
         return
-    for token in tokenize.generate_tokens(io.StringIO(text).readline):
-        if token.type in (tokenize.COMMENT, tokenize.STRING):
+    for token in tokens(path):
+        if token.type != tokenize.NAME:
             for code in re.findall("``(.+?)``", token.string, re.DOTALL):
                 yield token.start[0], code
 
@@ -93,7 +98,8 @@ def test_names_in_double_backticks_exist():
                 for owner, name in itertools.pairwise(["", *dotted.split(".")]):
                     # Letters are sizes, and mj_ and the like begin names of C MuJoCo.
                     checked = len(name) > 1 and not re.match("mj[cu]?_", name)
-                    if checked and name not in fields | modules.get(owner, others):
+                    exists = name in fields or name in modules.get(owner, others)
+                    if checked and not exists:
                         missing.append(f"{path.relative_to(ROOT)}:{line}: {dotted}")
     assert missing == []
 

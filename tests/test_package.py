@@ -2,6 +2,7 @@
 
 import ast
 import collections
+import functools
 import graphlib
 import json
 import re
@@ -102,8 +103,10 @@ def folder(module):
     return "__main__" if module in COMMANDS else module.partition(".")[0]
 
 
+@functools.cache
 def imported(path):
     """The package's own modules that a file imports, at its top or in its functions."""
+    modules = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         names = []
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mjx_reinforce"):
@@ -113,7 +116,8 @@ def imported(path):
             ]
         elif isinstance(node, ast.Import):
             names = [alias.name for alias in node.names if "mjx_reinforce." in alias.name]
-        yield from (name.removeprefix("mjx_reinforce.") for name in names if "." in name)
+        modules += [name.removeprefix("mjx_reinforce.") for name in names if "." in name]
+    return modules
 
 
 def test_imports_point_one_way():
@@ -276,6 +280,7 @@ def test_type_checkers_see_the_public_names():
     assert mjx_reinforce._HOME.keys() == {alias.name for node in imports for alias in node.names}
 
 
+@pytest.mark.slow
 def test_type_checkers_know_the_types(tmp_path):
     """From another folder, as they see what is installed: ``pip install -e .`` too."""
     (tmp_path / "own.py").write_text(TYPED)

@@ -50,7 +50,7 @@ def shapes(tree):
 @pytest.mark.parametrize(
     "id",
     [
-        pytest.param(id, marks=pytest.mark.slow) if id in HEAVY else id
+        pytest.param(id, marks=pytest.mark.slow) if id in HEAVY | {"Reacher-v5"} else id
         for id in sorted(set(IDS) - ALIKE)
     ],
 )

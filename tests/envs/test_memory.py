@@ -144,6 +144,7 @@ def test_all_engines_play_the_same_episodes(env, by_vmap, engine):
         np.testing.assert_allclose(other, expected, rtol=0, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_one_episode_in_c_mujoco_is_that_of_the_task(env):
     """``watch`` plays with it; the first observations of 100 starts have different commands."""
     key = jax.random.key(5)
@@ -209,6 +210,7 @@ def test_a_push_changes_the_velocity_with_which_a_step_begins(env):
         np.testing.assert_allclose(change, push, atol=0.12)
 
 
+@pytest.mark.slow
 def test_environments_in_lockstep_begin_episodes_with_a_memory_of_their_own(env):
     vec = make_vec(env, num_envs=4)
     state = vec.reset(jax.random.key(0))

@@ -124,7 +124,7 @@ class Near(Cart):
 def played(reset, step):
     """Returns the observations, rewards, ends and metrics of episodes, [T + 1, N, ...] each."""
     keys = jax.random.split(jax.random.key(0), EPISODES)
-    state = jax.vmap(reset)(keys)
+    state = jax.jit(jax.vmap(reset))(keys)
     states = [state]
     step = jax.jit(jax.vmap(step))
     for number in range(STEPS - 1):
@@ -163,6 +163,7 @@ def test_a_task_plays_as_by_itself():
         np.testing.assert_allclose(y, x, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_engines_play_the_same():
     """With a reward of the user's own class."""
     env = envs.from_playground(Near())
@@ -218,6 +219,7 @@ def test_the_exchange_is_undone():
     assert [getattr(place, name) for place, name in FUNCTIONS] == functions
 
 
+@pytest.mark.slow
 def test_importing_this_package_imports_no_playground():
     code = "import sys, mjx_reinforce.envs.playground; print('mujoco_playground' in sys.modules)"
     command = [sys.executable, "-c", code]

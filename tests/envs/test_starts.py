@@ -254,6 +254,7 @@ def test_an_action_applies_its_control(float64, engine):
     np.testing.assert_array_equal(peer.data.ctrl, env.home + SCALE * 0.5)
 
 
+@pytest.mark.slow
 def test_the_physics_kept_whole_gets_the_control():
     """As a team of a GPU's lanes has it: its first operand is ctrl."""
     env = Servo()
@@ -323,7 +324,7 @@ def rod():
     return spec
 
 
-@pytest.mark.parametrize("engine", ["vmap", "mujoco"])
+@pytest.mark.parametrize("engine", [pytest.param("vmap", marks=pytest.mark.slow), "mujoco"])
 def test_specs_play(engine):
     """The motor pushes the rod over; where it became a servo, the rod goes where it is told."""
     changed = rod()

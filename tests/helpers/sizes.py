@@ -5,17 +5,11 @@ of ``docs/``.
 """
 
 import ast
-import io
 import re
 import sys
-import tokenize
 import tomllib
 from pathlib import Path
 
-_SILENT = (
-    *(tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT),
-    *(tokenize.ENCODING, tokenize.ENDMARKER),
-)
 #: A function that takes more lines, its docstring apart, is long.
 _LONG = 60
 
@@ -33,15 +27,22 @@ def code_lines(text):
     """Returns the numbers of the lines of Python that are code."""
     lines = {
         number
-        for token in tokenize.generate_tokens(io.StringIO(text).readline)
-        if token.type not in _SILENT
-        for number in range(token.start[0], token.end[0] + 1)
+        for number, line in enumerate(text.splitlines(), start=1)
+        if line.strip() and not line.lstrip().startswith("#")
     }
+    docstrings = set()
     for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Constant | ast.JoinedStr):
+            lines |= _lines(node)
         docstring = _docstring(node)
         if docstring is not None:
-            lines -= set(range(docstring.lineno, docstring.end_lineno + 1))
-    return lines
+            docstrings |= _lines(docstring)
+    return lines - docstrings
+
+
+def _lines(node):
+    """Returns the numbers of the lines that a node is on."""
+    return set(range(node.lineno, node.end_lineno + 1))
 
 
 def _docstring(node):

@@ -6,10 +6,8 @@ With folders, it prints also where each of them departs from what tests/test_nam
 import ast
 import collections
 import functools
-import io
 import itertools
 import sys
-import tokenize
 from typing import NamedTuple
 
 from places import ROOT
@@ -62,7 +60,7 @@ class Style(NamedTuple):
 
 
 class Module(NamedTuple):
-    """A file of Python as a tree, and the numbers of its lines of code and of its comments."""
+    """A file of Python as a tree, and the numbers of its lines of code and those of comments."""
 
     tree: ast.Module
     code: set[int]
@@ -73,12 +71,13 @@ class Module(NamedTuple):
 def read(path):
     """Returns the ``Module`` in a file, without comments of constants (``#:``)."""
     text = path.read_text("utf-8")
+    code = code_lines(text)
     comments = {
-        token.start[0]
-        for token in tokenize.generate_tokens(io.StringIO(text).readline)
-        if token.type == tokenize.COMMENT and not token.string.startswith("#:")
+        number
+        for number, line in enumerate(text.splitlines(), start=1)
+        if line.lstrip().startswith("#") and not line.lstrip().startswith("#:")
     }
-    return Module(ast.parse(text), code_lines(text), comments)
+    return Module(ast.parse(text), code, comments - code)
 
 
 def bound_names(module):
@@ -127,7 +126,7 @@ def measure(paths):
         inside = set().union(*(lines for _, lines in functions(module)))
         counts["code"] += len(module.code)
         counts["names"] += len([*bound_names(module)])
-        counts["comments"] += len(module.comments & inside - module.code)
+        counts["comments"] += len(module.comments & inside)
         counts.update(departure.kind for departure in departures(path))
     return Style(**counts)
 

@@ -51,6 +51,7 @@ def test_training_is_the_same_in_every_unit():
     np.testing.assert_allclose(trained(Geared(2.0**-10)), expected, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_gripper_learns():
     """Its actions are from 0 to 255."""
     np.testing.assert_allclose(trained(Geared(127.5, 127.5)), trained(Geared(1.0)), atol=1e-3)

@@ -96,7 +96,7 @@ def test_first_weights_are_pytorchs(name):
     """Uniform within 1 / sqrt(fan-in), biases too; the critic's as well."""
     config = PRESETS[name][1]
     learner = build(envs.make(config.env), config).learner
-    state = jax.vmap(learner.init)(jax.random.split(jax.random.key(0), 50))
+    state = jax.jit(jax.vmap(learner.init))(jax.random.split(jax.random.key(0), 50))
     params = [state.actor.params["network"]["params"]]
     if name == "baseline-truncated-normal":
         params.append(state.estimator_state.params["params"])

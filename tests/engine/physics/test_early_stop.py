@@ -85,6 +85,7 @@ def test_more_contacts_than_room_end_where_c_does(native):
     assert error < 1e-9 < 1e-3 < far
 
 
+@pytest.mark.slow
 def test_limits_end_where_c_does():
     """Their closed form would be the optimum."""
     model, start = plays(ARM, 1, 2)

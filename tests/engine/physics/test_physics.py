@@ -109,6 +109,7 @@ def test_single_precision_is_no_worse_than_that_of_mjx():
         assert our_error[name] < max(1e-6, 2 * their_error[name]), name
 
 
+@pytest.mark.slow
 def test_without_constraints():
     options = {"disableflags": mjx.DisableBit.CONSTRAINT}
     with jax.enable_x64(True):

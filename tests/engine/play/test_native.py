@@ -23,7 +23,17 @@ if reason := available.unavailable():
     pytest.skip(reason, allow_module_level=True)
 
 
-@pytest.mark.parametrize("name", sorted(DISTRIBUTIONS))
+#: In a newcomer's `pytest` too; tests/learning/test_distributions.py has how all are written out.
+QUICK = ("categorical", "normal")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow)
+        for name in sorted(DISTRIBUTIONS)
+    ],
+)
 def test_every_distribution_draws_the_same_noise(name):
     """Over three chunks, in lanes that are at different steps."""
     space = Box(np.array([-3.0]), np.array([1.0]))

@@ -47,7 +47,15 @@ _MORE_VECTORS = {
         "3 steps of trees that tendons, joints and contacts join, implicitfast",
     ],
 }
-_OF_MOCAP = [x for x in _MODELS["features"] if "mocap" in x]
+_SHARED = [
+    "spatial tendons",
+    "limits and friction loss of tendons",
+    "a tendon between two trees, implicitfast",
+    "weld of two bodies",
+    *(x for x in _MODELS["features"] if "mocap" in x),
+]
+#: Those that eight lanes share in a newcomer's `pytest` too.
+_QUICKLY_SHARED = ("spatial tendons", "mocap bodies that touch", "weld to a mocap body")
 _MANY = '<geom size=".1"/>'
 _BOX = '<geom type="box" size=".1 .1 .1"/>'
 _TWO = """
@@ -243,15 +251,14 @@ def test_tasks_in_vectors(task, tmp_path):
 
 
 @needs_compiler
-@pytest.mark.parametrize("lanes", [2, 8])
 @pytest.mark.parametrize(
-    "feature",
+    ("feature", "lanes"),
     [
-        "spatial tendons",
-        "limits and friction loss of tendons",
-        "a tendon between two trees, implicitfast",
-        "weld of two bodies",
-        *_OF_MOCAP,
+        pytest.param(
+            *(x, lanes), marks=[] if lanes == 8 and x in _QUICKLY_SHARED else pytest.mark.slow
+        )
+        for x in _SHARED
+        for lanes in (2, 8)
     ],
 )
 def test_lanes_share_cables_and_mocap_bodies(feature, lanes, tmp_path):
