@@ -8,7 +8,7 @@ import numpy as np
 from mjx_reinforce.engine.team.tables.store import Tables
 
 _C: Any = mujoco  # a C extension without stubs
-_NO_LIMIT = 1e30
+_NO_RANGE = (-1e30, 1e30)
 
 
 def fill(tables: Tables) -> None:
@@ -20,9 +20,8 @@ def fill(tables: Tables) -> None:
     gear[[x.actuator for x in tables.cables if x.actuator >= 0]] = 1
     order = np.argsort(targets, kind="stable")
     tables.actuator_order = order
-    no_range = (-_NO_LIMIT, _NO_LIMIT)
-    controls = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, no_range)
-    forces = np.where(model.actuator_forcelimited[:, None], model.actuator_forcerange, no_range)
+    controls = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, _NO_RANGE)
+    forces = np.where(model.actuator_forcelimited[:, None], model.actuator_forcerange, _NO_RANGE)
     gain = model.actuator_gainprm[:, :3].copy()
     bias = model.actuator_biasprm[:, :3].copy()
     # All are affine here: what MuJoCo does not read of the others is zero.
@@ -49,7 +48,7 @@ def fill(tables: Tables) -> None:
     tables.ints["target_actuator"] = np.searchsorted(targets[order], counts)
     joint = tables.dof_joint
     is_limited = model.jnt_actfrclimited[joint, None]
-    bounds = np.where(is_limited, model.jnt_actfrcrange[joint], no_range)
+    bounds = np.where(is_limited, model.jnt_actfrcrange[joint], _NO_RANGE)
     tables.add_records("dof_force", low=bounds[:, 0], high=bounds[:, 1])
 
 

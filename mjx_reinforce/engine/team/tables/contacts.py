@@ -4,14 +4,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from mjx_reinforce.engine.team import flags, records, supported
-from mjx_reinforce.engine.team.contact_kinds import (
-    MIN_VALUE,
-    ContactKind,
-    Mix,
-    contact_kind,
-    mix_of,
-)
+from mjx_reinforce.engine.team import contact_kinds, flags, records, supported
+from mjx_reinforce.engine.team.contact_kinds import MIN_VALUE, ContactKind, contact_kind
 from mjx_reinforce.engine.team.tables import draws, geoms
 from mjx_reinforce.engine.team.tables.solver import is_elliptic
 from mjx_reinforce.engine.team.tables.store import Tables
@@ -35,7 +29,7 @@ def fill(tables: Tables, num_near: int) -> None:
     item_kinds = []
     weights = []
     for pair, kind in pairs:
-        mix = mix_of(model, pair) if has_friction else Mix.LARGER
+        mix = contact_kinds.mix_of(model, pair) if has_friction else contact_kinds.Mix.LARGER
         number = kind_numbers.setdefault((kind, mix), len(kind_numbers))
         bodies = model.geom_bodyid[[pair.geom1, pair.geom2]]
         weight = sum(model.body_invweight0[body, 0] for body in bodies)
