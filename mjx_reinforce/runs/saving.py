@@ -16,14 +16,7 @@ import numpy as np
 
 from mjx_reinforce import files
 from mjx_reinforce.export.policy_files import save_policy
-from mjx_reinforce.files import (
-    Arrays,
-    check_place,
-    remove_leftovers,
-    write_arrays,
-    write_bytes,
-    write_json,
-)
+from mjx_reinforce.files import Arrays, check_place, write_arrays, write_bytes, write_json
 from mjx_reinforce.reports.charts import curves
 from mjx_reinforce.runs.plan import GroupPlan, Plan
 from mjx_reinforce.runs.sinks import Sink, open_sinks
@@ -77,7 +70,7 @@ class Files(Observer[DriverT]):
         """Removes what a crash left of writing files."""
         # Compiling took its time, in which the directory may have been moved.
         self._check_place()
-        remove_leftovers(self._directory, *(self._directory / name for name in self._folders))
+        files.remove_leftovers(self._directory, *(self._directory / name for name in self._folders))
 
     def has(self, chunk: str) -> bool:
         """Returns whether the runs of this name have ended."""

@@ -12,16 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from mjx_reinforce import files
 from mjx_reinforce.console.commands import typed
 from mjx_reinforce.export.policy_files import actor_of, arrays_of, check_arrays, save_policy
-from mjx_reinforce.files import (
-    Arrays,
-    naming_damage,
-    read_arrays,
-    remove_leftovers,
-    write_arrays,
-    write_json,
-)
+from mjx_reinforce.files import Arrays, naming_damage, read_arrays, write_arrays, write_json
 from mjx_reinforce.reports.experiment import lengthened
 from mjx_reinforce.runs.design import as_record
 from mjx_reinforce.runs.plan import GroupPlan, Plan
@@ -85,7 +79,7 @@ class SweepFiles(Files[Driver]):
         super().open()
         self._parts.mkdir(exist_ok=True)
         # The folders in parts/ are those of chunks' checkpoints.
-        remove_leftovers(*self._parts.glob("*/"))
+        files.remove_leftovers(*self._parts.glob("*/"))
         # Before anything is trained: they are joined when all is.
         for group_plan in itertools.chain.from_iterable(self.stages()):
             for runs in group_plan.chunks:

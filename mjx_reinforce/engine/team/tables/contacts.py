@@ -77,13 +77,11 @@ def _fill_kinds(tables: Tables, kinds: list[ContactKind]) -> None:
     tables.ints["kind_soft"] = [tables.number(x.softness) for x in kinds]
     tables.reals["kind_margin"] = [x.margin for x in kinds]
     tables.reals["kind_friction"] = [x.friction for x in kinds]
-    tables.reals["kind_mu"] = []
-    tables.ints["kind_soft_friction"] = []
-    if is_elliptic(tables.model):
-        # C's regularized friction of the cone.
-        root = np.sqrt(max(tables.model.opt.impratio, MIN_VALUE))
-        tables.reals["kind_mu"] = [x.friction[0] / root for x in kinds]
-        tables.ints["kind_soft_friction"] = [tables.number(x.friction_softness) for x in kinds]
+    # C's regularized friction of the cone.
+    cone_kinds = kinds if is_elliptic(tables.model) else []
+    root = np.sqrt(max(tables.model.opt.impratio, MIN_VALUE))
+    tables.reals["kind_mu"] = [x.friction[0] / root for x in cone_kinds]
+    tables.ints["kind_soft_friction"] = [tables.number(x.friction_softness) for x in cone_kinds]
 
 
 def _fill_convex(
