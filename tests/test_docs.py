@@ -20,7 +20,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.commands import COMMANDS
 from mjx_reinforce.envs import parts
 from mjx_reinforce.registry import load_definition
-from mjx_reinforce.training.record import COLUMNS
+from mjx_reinforce.training.rows import COLUMNS
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"

@@ -11,7 +11,7 @@ from measured_runs import ONE
 from mjx_reinforce import files
 from mjx_reinforce.reports.sources import read_directory
 from mjx_reinforce.runs.results import read_results
-from mjx_reinforce.runs.saving import SweepFiles
+from mjx_reinforce.runs.sweep_saving import SweepFiles
 
 
 def test_contents_are_on_the_disk_before_the_name_and_then_the_name(tmp_path, monkeypatch):

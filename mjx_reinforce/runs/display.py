@@ -20,7 +20,7 @@ from mjx_reinforce.files import Arrays
 from mjx_reinforce.reports.experiment import counted, say, setting_in_words
 from mjx_reinforce.runs.plan import GroupPlan, Plan
 from mjx_reinforce.statistics import enough, iqm
-from mjx_reinforce.training import record
+from mjx_reinforce.training import failures, record
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer, RunDriver
 
 
@@ -161,7 +161,7 @@ class Display(Observer[RunDriver]):
         """Says once which seeds met numbers that are not finite; the last table counts them."""
         if num_nonfinite.any() and not self._nonfinite_shown:
             self._nonfinite_shown = True
-            text = record.describe_nonfinite(
+            text = failures.describe_nonfinite(
                 num_nonfinite, driver.config.first_seed, driver.updates()
             )
             self.say(text, "yellow")

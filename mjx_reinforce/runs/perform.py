@@ -233,7 +233,8 @@ def perform(
             from mjx_reinforce.runs.compile_times import describe_compiling
             from mjx_reinforce.runs.conduct import conduct
             from mjx_reinforce.runs.plan import describe, make_plan
-            from mjx_reinforce.runs.saving import RunFiles, SweepFiles
+            from mjx_reinforce.runs.saving import RunFiles
+            from mjx_reinforce.runs.sweep_saving import SweepFiles
         except MemoryError as error:
             raise ImportError(f"no memory is left {error}".strip()) from error
 

@@ -14,9 +14,11 @@ from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.training import race
+from mjx_reinforce.training.failures import HOPELESS
 from mjx_reinforce.training.minutes import Deadline, env_steps_in
-from mjx_reinforce.training.record import HOPELESS, Measured, Record, RunRecord
+from mjx_reinforce.training.record import Measured, Record
 from mjx_reinforce.training.resume import Checkpoint, check_arrays, decisive
+from mjx_reinforce.training.run_record import RunRecord
 from mjx_reinforce.training.slots import Slots, Stopwatch
 from mjx_reinforce.training.state import (
     Best,

@@ -64,6 +64,8 @@ def test_each_model_has_a_row_and_is_judged_once(tmp_path):
     for row in (slow, fast):
         assert float(row["error"]) <= playing.EQUAL
         assert float(row["ratio"]) > 0
+    timed = [row for row in raw_rows if row["phase"] == "speed"]
+    assert all(float(row["ratio_by_clock"]) > 0 for row in timed)
 
 
 @pytest.mark.slow
@@ -175,6 +177,19 @@ def test_a_difference_is_seen_wherever_it_is(name, place):
     error, words = playing.difference(expected._replace(**{name: array}), expected)
     assert error == pytest.approx(1e-6)
     assert words.startswith(name)
+
+
+def test_robots_timed_with_a_c_compiler_are_in_a_table():
+    made = {"why": "machine code for this CPU, made by the C++ compiler", "engine": "native"}
+    made |= {"model": "a/scene.xml", "stubs": "", "verdict": "measured", "cause": ""}
+    made |= {"steps_per_s": "12345", "ratio": "3.2", "ratio_by_clock": "3.1"}
+    late = dict.fromkeys(made, "") | {"model": "late", "verdict": "too long", "cause": "over 9 s"}
+    slow = made | {"why": "it has a plugin", "engine": "mujoco", "ratio": "0.9", "stubs": "stubs"}
+    assert page.cpu_robots([late, made, slow]).splitlines()[2:] == [
+        "| a/scene.xml (stubs) | C MuJoCo's own | 12,345 | 0.9 | 3.1 |",
+        "| a/scene.xml | C++ | 12,345 | 3.2 | 3.1 |",
+        "| late |  | too long: over 9 s |  |  |",
+    ]
 
 
 def test_the_page_is_that_of_the_rows():

@@ -3,7 +3,7 @@
 import csv
 import json
 
-from mjx_reinforce.training.record import header
+from mjx_reinforce.training.rows import header
 
 #: What a small sweep goes over.
 ONE = {"learning_rate": [1e-3, 3e-3]}

@@ -9,7 +9,8 @@ import pytest
 from mjx_reinforce import train
 from mjx_reinforce.report import WrittenReport
 from mjx_reinforce.runs import command_line, perform, plan, saving
-from mjx_reinforce.runs.saving import Files, RunFiles, SweepFiles
+from mjx_reinforce.runs.saving import Files, RunFiles
+from mjx_reinforce.runs.sweep_saving import SweepFiles
 from mjx_reinforce.training import driver
 
 RUN = ["--env", "ContinuousCartPole-v0", "--env-steps", "None", "--num-seeds", "3"]

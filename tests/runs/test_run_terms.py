@@ -9,7 +9,7 @@ from toys import Paid
 
 import mjx_reinforce as mr
 from mjx_reinforce.reports.sources import read_metrics
-from mjx_reinforce.training.record import COLUMNS
+from mjx_reinforce.training.rows import COLUMNS
 
 
 class Unbroken(Paid):

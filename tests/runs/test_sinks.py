@@ -18,7 +18,7 @@ from mjx_reinforce.runs import sinks
 from mjx_reinforce.runs.saving import RunFiles
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import iqm, iqm_interval
-from mjx_reinforce.training import record
+from mjx_reinforce.training import rows
 
 
 def evaluation(update, num_seeds=20, first=False):
@@ -35,7 +35,7 @@ def evaluation(update, num_seeds=20, first=False):
     measured |= {} if first else dict.fromkeys(metrics, values) | dict.fromkeys(counts, updates)
     measured |= {"seed": np.arange(num_seeds), "update": updates}
     measured |= {"episodes": 4 * updates, "env_steps": 40 * updates}
-    return record.as_rows(measured, 0.1 * update)
+    return rows.as_rows(measured, 0.1 * update)
 
 
 def begin(directory, config):
@@ -52,7 +52,7 @@ def begin(directory, config):
 @pytest.fixture
 def directory(tmp_path):
     """A run's directory with its metrics.csv, and settings, as sinks find it."""
-    (tmp_path / "metrics.csv").write_bytes(record.header(()))
+    (tmp_path / "metrics.csv").write_bytes(rows.header(()))
     (tmp_path / "config.json").write_text('{"env": "Survive-v0", "learning_rate": 0.01}')
     return tmp_path
 
@@ -122,7 +122,7 @@ def test_before_the_first_update_its_columns_are_not_shown():
 def test_cells_come_back_to_the_last_bit(dtype, data):
     floats = st.floats(width=np.finfo(dtype).bits)
     values = np.array(data.draw(st.lists(floats, min_size=1)), dtype)
-    back = np.array([*map(float, record._cells(values))], dtype)
+    back = np.array([*map(float, rows._cells(values))], dtype)
     np.testing.assert_array_equal(back, values)
     number = ~np.isnan(values)  # of NaN, text keeps no sign
     np.testing.assert_array_equal(np.signbit(back[number]), np.signbit(values[number]))

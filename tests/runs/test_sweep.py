@@ -28,7 +28,7 @@ from mjx_reinforce.runs import command_line, conduct, perform, plan
 from mjx_reinforce.runs.design import Design, check_design, read_design
 from mjx_reinforce.runs.plan import make_groups
 from mjx_reinforce.runs.results import read_results
-from mjx_reinforce.runs.saving import SweepFiles, join_parts
+from mjx_reinforce.runs.sweep_saving import SweepFiles, join_parts
 from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.setup import ready
 from mjx_reinforce.setup.build import build

@@ -11,7 +11,7 @@ from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup.ready import build_ready
 from mjx_reinforce.training import driver as module
 from mjx_reinforce.training.driver import Runs, begin_run
-from mjx_reinforce.training.record import HOPELESS
+from mjx_reinforce.training.failures import HOPELESS
 
 CONFIG = Config(
     env="ContinuousCartPole-v0",

@@ -9,7 +9,7 @@ import pytest
 from mjx_reinforce.report import WrittenReport
 from mjx_reinforce.runs import command_line, perform
 from mjx_reinforce.runs.results import read_results
-from mjx_reinforce.runs.saving import SweepFiles
+from mjx_reinforce.runs.sweep_saving import SweepFiles
 from mjx_reinforce.statistics.sequential import look_seeds, sequential_test
 from mjx_reinforce.training import driver
 

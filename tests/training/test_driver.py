@@ -8,7 +8,8 @@ from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.driver import RunDriver, Runs
-from mjx_reinforce.training.record import Measured, RunRecord
+from mjx_reinforce.training.record import Measured
+from mjx_reinforce.training.run_record import RunRecord
 from mjx_reinforce.training.state import Best, first_best, keep_best
 
 BLOCK = 2

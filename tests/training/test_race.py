@@ -24,7 +24,8 @@ from mjx_reinforce.runs import command_line
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training import race
 from mjx_reinforce.training.driver import RunDriver, Runs
-from mjx_reinforce.training.record import Measured, RunRecord
+from mjx_reinforce.training.record import Measured
+from mjx_reinforce.training.run_record import RunRecord
 from mjx_reinforce.training.state import RunState, copied
 
 SMALL = ["--env", "ContinuousCartPole-v0", "--num-seeds", "2", "--eval-episodes", "2"]

@@ -14,9 +14,10 @@ from mjx_reinforce.engine.base import Trajectory
 from mjx_reinforce.runs import display
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import summarize
-from mjx_reinforce.training import record as measured
+from mjx_reinforce.training import failures, rows
 from mjx_reinforce.training.programs import evaluate
-from mjx_reinforce.training.record import Measured, Progress, RunRecord
+from mjx_reinforce.training.record import Measured, Progress
+from mjx_reinforce.training.run_record import RunRecord
 
 
 def block(random, num_updates, num_seeds):
@@ -116,8 +117,8 @@ def test_a_record_of_two_seeds_by_hand():
     assert met.tolist() == [1, 0]
     second = record.add_evaluation(evaluation_of(7, 10), 2.00009)
     keys = ("seed", "update", "episodes", "env_steps", "wall_seconds", "train_return")
-    rows = measured.lines({key: second[key] for key in keys}).decode().split()
-    assert [row.rstrip(",") for row in rows] == ["0,2,4,70,2.0,nan", "1,1,2,40,2.0,4.0"]
+    written = rows.lines({key: second[key] for key in keys}).decode().split()
+    assert [row.rstrip(",") for row in written] == ["0,2,4,70,2.0,nan", "1,1,2,40,2.0,4.0"]
     assert second["skipped_update"].tolist() == [1, 0]
     progress = record.progress()
     assert progress[:-2] == ((1 + 40 / 60) / 2, 2, 55.0, 8.5, 7.0, 0, 2)
@@ -153,7 +154,7 @@ def test_a_seed_is_broken_while_nothing_of_it_is_finite():
         "skipped_update": np.array([[0, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0]]),
         "episodes": np.full((3, 4), 4),
     }
-    count = measured.broken_in_a_row(np.array([2, 0, 5, 1]), metrics)
+    count = failures.broken_in_a_row(np.array([2, 0, 5, 1]), metrics)
     assert count.tolist() == [5, 3, 2, 2]
 
 
@@ -173,7 +174,7 @@ def test_a_run_is_hopeless_if_all_that_train_are():
 
 def test_broken_updates_are_one_line_with_the_remedy():
     met = np.repeat([0, 2], [994, 6])
-    assert measured.describe_nonfinite(met, 7, 9) == (
+    assert failures.describe_nonfinite(met, 7, 9) == (
         "up to update 9, 6 of 1,000 seeds (numbers 1001, 1002, 1003, 1004, 1005, ...) met values "
         "that are not finite or beyond 1e10. Such an episode counts as the worst of its update. "
         "This line comes once; the number of such updates comes at the end. If they are many, give "

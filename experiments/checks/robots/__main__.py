@@ -4,13 +4,15 @@
     python -m experiments.checks.robots equality ROWS.csv FOLDER          # by the engine of auto
     python -m experiments.checks.robots speed ROWS.csv FOLDER
     python -m experiments.checks.robots page ROWS.csv
+    python -m experiments.checks.robots cpu-page ROWS.csv
     python -m experiments.checks.robots teams TEAMS.csv FOLDER
     python -m experiments.checks.robots gpu GPU.csv FOLDER --listed TEAMS.csv --seconds 560
     python -m experiments.checks.robots gpu-page GPU.csv FOLDER --listed TEAMS.csv
 
 FOLDER has a folder for each package, such as pip has unpacked. Each model is judged by a process of
 its own, with limits of time and memory. ROWS.csv gets a row each, and a model that has its row is
-skipped, so a run can be cut off and continued. ``page`` writes docs/robots.csv and docs/robots.md.
+skipped, so a run can be cut off and continued. ``page`` writes docs/robots.csv and docs/robots.md;
+``cpu-page`` writes docs/robots_cpu.csv and the page, of rows of ``speed`` with a C++ compiler.
 ``teams`` asks which models the device code of teams covers, compares what it covers with C MuJoCo,
 and prints the counts; its rows, of other columns (see teams.py), have a file of their own. ``gpu``
 times these models on a GPU, beside MuJoCo Warp where it is installed, and is to be called again
@@ -32,6 +34,7 @@ from experiments.kit import rows
 #: Columns of the rows; what a phase does not measure is empty.
 COLUMNS = ("phase", "asked", "package", "model", "mechanism", "stubs", "actuators", "verdict")
 COLUMNS += ("auto", "engine", "why", "error", "cause", "seconds", "steps_per_s", "ratio")
+COLUMNS += ("ratio_by_clock",)
 #: Verdicts of what no engine plays.
 _NOT_PLAYED = ("no model", "same mechanism", "no actuators")
 
@@ -40,7 +43,9 @@ _NOT_PLAYED = ("no model", "same mechanism", "no actuators")
 class Settings:
     """Judge models that others wrote."""
 
-    phase: tyro.conf.Positional[Literal["equality", "speed", "page", "teams", "gpu", "gpu-page"]]
+    phase: tyro.conf.Positional[
+        Literal["equality", "speed", "page", "cpu-page", "teams", "gpu", "gpu-page"]
+    ]
     """What to do."""
     output: tyro.conf.Positional[Path]
     """The rows."""
@@ -114,6 +119,8 @@ def main(settings: Settings) -> None:
     """Does what is asked for."""
     if settings.phase == "page":
         page.write(rows.read(settings.output))
+    elif settings.phase == "cpu-page":
+        page.write_cpu(rows.read(settings.output))
     elif settings.phase in ("gpu", "gpu-page"):
         if settings.listed is None:
             raise ValueError(f"{settings.phase} needs --listed, the rows of teams")

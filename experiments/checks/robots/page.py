@@ -14,10 +14,14 @@ from experiments.kit.places import ROOT
 
 CSV = ROOT / "docs" / "robots.csv"
 GPU_CSV = ROOT / "docs" / "robots_gpu.csv"
+CPU_CSV = ROOT / "docs" / "robots_cpu.csv"
 PAGE = ROOT / "docs" / "robots.md"
 #: Columns of docs/robots.csv.
 COLUMNS = ("package", "model", "engine", "why", "verdict", "error", "cause", "in_c_mujoco")
 COLUMNS += ("steps_per_s", "ratio")
+#: Columns of docs/robots_cpu.csv: of the rows of ``speed``.
+_CPU_COLUMNS = ("package", "model", "stubs", "engine", "why", "verdict", "cause", "steps_per_s")
+_CPU_COLUMNS += ("ratio", "ratio_by_clock")
 #: Verdicts of files that are no robot for a policy, and what the page says of them.
 _NOT_PLAYED = {
     "no model": "C MuJoCo does not load them: parts of other files, or files that are missing",
@@ -157,11 +161,33 @@ def _package(package: str, models: Sequence[Mapping[str, Any]]) -> Iterator[str]
     yield table(["model", "engine", "why", "from C MuJoCo", "env steps/s", "ratio"], lines)
 
 
+def cpu_robots(timed: Sequence[Mapping[str, Any]]) -> str:
+    """Returns a table of robots that were timed with a C++ compiler, by their ratio."""
+    lines = []
+    for row in sorted(timed, key=lambda row: float(row["ratio"] or "inf")):
+        speed = f"{row['verdict']}: {row['cause']}"
+        if row["ratio"]:
+            speed = f"{int(row['steps_per_s']):,}"
+        name = row["model"] + (f" ({row['stubs']})" if row["stubs"] else "")
+        lines.append([name, _compiler(row), speed, row["ratio"], row["ratio_by_clock"]])
+    ratios = ("ratio by seconds of the CPU", "ratio by the clock")
+    return table(["model", "machine code by", "env steps/s", *ratios], lines)
+
+
+def _compiler(row: Mapping[str, Any]) -> str:
+    """Returns what made the machine code that played a robot."""
+    if "C++" in row["why"]:
+        return "C++"
+    names = {"native": "LLVM", "mujoco": "C MuJoCo's own", "vmap": "XLA"}
+    return names.get(row["engine"], "")
+
+
 def page(text: str, models: Sequence[Mapping[str, Any]]) -> str:
     """Returns docs/robots.md with the tables of these models."""
     makers = {"totals": totals, "equality": equality, "engines": engines, "robots": robots}
     tables = {name: lambda maker=maker: maker(models) for name, maker in makers.items()}
-    of_gpu = rows.read(GPU_CSV)
+    of_gpu, of_cpu = map(rows.read, (GPU_CSV, CPU_CSV))
+    tables |= {"cpu_robots": lambda: cpu_robots(of_cpu)}
     tables |= {"gpu": lambda: gpu.summary(of_gpu), "gpu_robots": lambda: gpu.robots(of_gpu)}
     tables["gpu_speeds"] = lambda: gpu.speeds(of_gpu)
     return filled(text, tables)
@@ -170,6 +196,12 @@ def page(text: str, models: Sequence[Mapping[str, Any]]) -> str:
 def write(raw_rows: Sequence[Mapping[str, Any]]) -> None:
     """Writes docs/robots.csv and the tables of docs/robots.md."""
     rows.write(CSV, merged(raw_rows))
+    fill()
+
+
+def write_cpu(raw_rows: Sequence[Mapping[str, Any]]) -> None:
+    """Writes docs/robots_cpu.csv, of rows of ``speed`` in their order, and its table."""
+    rows.write(CPU_CSV, [{name: row[name] for name in _CPU_COLUMNS} for row in raw_rows])
     fill()
 
 

@@ -68,26 +68,21 @@ def team_physics(model: PhysicsModel) -> Physics:
     """Returns the physics of a model that teams play."""
     from mjx_reinforce.engine.team import tables
 
+    physics = Physics(
+        text=tables.physics_text(model.mj_model, random=model.random),
+        far=tables.far_words(model.mj_model, random=model.random),
+        skip=model.frame_skip,
+        lanes=1,
+        shared=0,
+    )
     if available.platform() == "cpu":
-        return Physics(
-            text=tables.physics_text(model.mj_model, random=model.random),
-            far=tables.far_words(model.mj_model, random=model.random),
-            skip=model.frame_skip,
-            lanes=1,
-            shared=0,
-        )
+        return physics
     lanes = _lanes(model)
     # Where a lane has two rows of the Newton step's matrix it needs more registers than the threads
     # of many warps have, and as many states do not fit into shared memory.
     has_room = model.mj_model.nv < lanes
-    return Physics(
-        text=tables.physics_text(model.mj_model, random=model.random),
-        far=tables.far_words(model.mj_model, random=model.random),
-        skip=model.frame_skip,
-        lanes=lanes,
-        shared=_shared_memory(),
-        warps=MANY_WARPS if has_room else FEW_WARPS,
-    )
+    warps = MANY_WARPS if has_room else FEW_WARPS
+    return physics._replace(lanes=lanes, shared=_shared_memory(), warps=warps)
 
 
 def _lanes(model: PhysicsModel) -> int:

@@ -1,5 +1,6 @@
 """What contacts have: condim, friction and softness, as C MuJoCo mixes and bounds them."""
 
+import enum
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +14,15 @@ MIN_VALUE = 1e-15
 _MIN_FRICTION = 1e-5
 _MIN_IMPEDANCE = 1e-4
 _MAX_IMPEDANCE = 1 - 1e-4
+
+
+class Mix(enum.IntEnum):
+    """Which geom's friction a contact has: the Mix of ``device/draws.h``."""
+
+    LARGER = 0
+    OF_FIRST = 1
+    OF_SECOND = 2
+    OF_PAIR = 3
 
 
 class ContactKind(NamedTuple):
@@ -105,6 +115,18 @@ def contact_kind(model: Any, pair: GeomPair) -> ContactKind:
         softness=softness,
         friction_softness=softness,
     )
+
+
+def mix_of(model: Any, pair: GeomPair) -> Mix:
+    """Returns which friction the contacts of a pair of geoms have (mj_contactParam)."""
+    if pair.pair >= 0:
+        return Mix.OF_PAIR
+    first, second = model.geom_priority[[pair.geom1, pair.geom2]]
+    if first == second:
+        return Mix.LARGER
+    if first > second:
+        return Mix.OF_FIRST
+    return Mix.OF_SECOND
 
 
 def _friction(coefficients: np.ndarray) -> tuple[float, ...]:

@@ -1,6 +1,6 @@
 """Which scalars of a program are one formula of other numbers, so that lanes may share them.
 
-Nothing is written here: see ``text``.
+Nothing is written here: see ``shared_work``.
 """
 
 from collections import Counter

@@ -20,23 +20,14 @@ class Softness(NamedTuple):
     power: float
 
 
-_ACTUATOR = (
-    "gear",
-    "control_low",
-    "control_high",
-    "gain",
-    "bias",
-    "bias_by_length",
-    "bias_by_speed",
-    "force_low",
-    "force_high",
-    "gain_by_length",
-    "gain_by_speed",
-)
+_ACTUATOR = """
+    gear control_low control_high gain bias bias_by_length bias_by_speed force_low force_high
+    gain_by_length gain_by_speed
+    """
 #: How many reals each field of a struct has.
 FIELDS = {
     "Softness": dict.fromkeys(Softness._fields, 1),
-    "Actuator": dict.fromkeys(_ACTUATOR, 1),
+    "Actuator": dict.fromkeys(_ACTUATOR.split(), 1),
     "Limit": {"range": 2, "margin": 1, "weight": 1},
     "Loss": {"most": 1, "weight": 1},
     "Range": {"low": 1, "high": 1},

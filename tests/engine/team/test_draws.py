@@ -10,6 +10,7 @@ import pytest
 
 from experiments.kit import device_code
 from mjx_reinforce.engine.team import tables
+from mjx_reinforce.engine.team.tables import draws
 from mjx_reinforce.envs import derived, models
 
 _C: Any = mujoco
@@ -153,7 +154,7 @@ def _error(m, play, fields, numbers):
 def test_numbers_of_the_model_itself_are_those_of_its_tables(options):
     m = _walker(options)
     own = {name: np.array(getattr(m, name)) for name in models.RANDOM}
-    layout = tables._Tables(m, tables.NUM_NEAR, models.RANDOM).layout
+    layout = draws.Layout(tables.of_model(m, tables.NUM_NEAR, models.RANDOM))
     expected = np.array(layout.base)[layout.places]
     assert len({*layout.places}) == len(layout.places) > 100
     np.testing.assert_allclose(_numbers(m, models.RANDOM, own), expected, rtol=1e-9, atol=1e-12)

@@ -5,7 +5,6 @@ entries from what ``MujocoEnv.randomize`` drew, and from what MuJoCo derives of 
 bodies, of mjData, are always among these tables.
 """
 
-import enum
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any, TypeAlias
 
@@ -17,7 +16,9 @@ import numpy as np
 from mjx_reinforce.engine.team import flags, records
 from mjx_reinforce.engine.team.contact_kinds import MIN_VALUE
 from mjx_reinforce.engine.team.frames import rotation, times
-from mjx_reinforce.engine.team.supported import SLIDE, GeomPair
+from mjx_reinforce.engine.team.supported import SLIDE
+from mjx_reinforce.engine.team.tables import passive
+from mjx_reinforce.engine.team.tables.store import Tables
 
 _C: Any = mujoco  # a C extension without stubs
 #: Fields that the inertias of links depend on, and those that inverse masses do.
@@ -31,33 +32,24 @@ _COLUMNS = np.array([0, 1, 2, 1, 2, 2])
 Entries: TypeAlias = dict[tuple[str, str], Any]
 
 
-class Mix(enum.IntEnum):
-    """Which geom's friction a contact has: the Mix of ``device/draws.h``."""
-
-    LARGER = 0
-    OF_FIRST = 1
-    OF_SECOND = 2
-    OF_PAIR = 3
-
-
 def effective(model: Any, random: Collection[str]) -> frozenset[str]:
     """Returns those of random fields that the flags of a model let it read."""
     return frozenset(random) - flags.disabled_fields(model)
 
 
-def entries(tables: Any, random: Collection[str], fields: Mapping[str, Any]) -> Entries:
+def entries(tables: Tables, fields: Mapping[str, Any]) -> Entries:
     """Returns what of a model's tables depends on random fields.
 
     Args:
-      tables: those of ``tables.py``.
-      random: the names of the fields, of ``effective``.
+      tables: all of them.
       fields: what an episode has in place of the model's fields, and what follows from it, by
         their names in mjModel; and ``mocap_pos`` and ``mocap_quat``.
     """
+    random = tables.random
     parts: Entries = {}
     model = _Episode(tables.model, fields)
     if _OF_LINKS.intersection(random):
-        parts |= _bodies(tables, model, random)
+        parts |= _bodies(tables, model)
     if INERTIAL.intersection(random):
         parts |= _weights(tables, model)
     # Degrees of freedom inherit armature and damping of actuators, too.
@@ -70,7 +62,7 @@ def entries(tables: Any, random: Collection[str], fields: Mapping[str, Any]) -> 
         stiffness = model.jnt_stiffness[joint]
         parts["dof_stiffness", ""] = jnp.where(is_single, stiffness, 0)[:, None]
         parts["dof_law", "stiffness"] = jnp.where(is_single, 0, stiffness)[:, None]
-    parts |= _actuators(tables, model, random)
+    parts |= _actuators(tables, model)
     if "geom_friction" in random:
         parts["geom_friction", ""] = model.geom_friction[tables.geoms]
     for field in ("mocap_pos", "mocap_quat"):
@@ -89,7 +81,7 @@ class _Episode:
         return self._fields[name] if name in self._fields else getattr(self._model, name)
 
 
-def _bodies(tables: Any, model: Any, random: Collection[str]) -> Entries:
+def _bodies(tables: Tables, model: Any) -> Entries:
     """Returns the inertias of bodies and links, what is compensated, and the medium's forces."""
     frames = tables.frames
     mass = model.body_mass
@@ -115,7 +107,7 @@ def _bodies(tables: Any, model: Any, random: Collection[str]) -> Entries:
     held = (mass * model.body_gravcomp)[:, None] * jnp.column_stack([com, jnp.ones(len(com))])
     bodies = tables.fluid_bodies
     has_mass, has_moment, has_center = (
-        name in random for name in ("body_mass", "body_inertia", "body_ipos")
+        name in tables.random for name in ("body_mass", "body_inertia", "body_ipos")
     )
     # Of a link that carries one body, the center is that of the body, unless nothing is there yet.
     is_shared = bool((is_of_link @ (1 + (tables.model.body_mass == 0)) > 1).any())
@@ -136,37 +128,12 @@ def _bodies(tables: Any, model: Any, random: Collection[str]) -> Entries:
         compensated = np.array(tables.ints["compensated_link"], int)
         parts["compensated", "moment"] = is_of_link[compensated] @ held
     if has_mass or has_moment:
-        resistances = fluid(jnp, model, bodies)
+        resistances = passive.fluid(jnp, model, bodies)
         parts |= {("fluid_body", field): part for field, part in resistances.items()}
     return parts
 
 
-def fluid(xp: Any, model: Any, bodies: np.ndarray) -> dict[str, Any]:
-    """Returns the fields of a FluidBody of ``records.py`` that depend on masses and inertias.
-
-    Args:
-      xp: NumPy, or that of JAX.
-      model: the model.
-      bodies: in the order of the table.
-    """
-    # A body is a box of the same inertia, or, where the medium is viscous, a ball.
-    inertia = model.body_inertia[bodies]
-    squares = inertia.sum(1, keepdims=True) - 2 * inertia
-    masses = model.body_mass[bodies][:, None]
-    box = xp.sqrt(xp.maximum(MIN_VALUE, squares) / xp.maximum(MIN_VALUE, masses) * 6)
-    box = xp.where(masses >= MIN_VALUE, box, 0)
-    diameter = box.mean(1, keepdims=True)
-    others = box[:, np.array([[1, 2], [0, 2], [0, 1]])]
-    opt = model.opt
-    return {
-        "viscous_torque": np.pi * opt.viscosity * diameter**3,
-        "viscous_force": 3 * np.pi * opt.viscosity * diameter,
-        "drag_torque": opt.density / 64 * box * (others**4).sum(2),
-        "drag_force": opt.density / 2 * others.prod(2),
-    }
-
-
-def _weights(tables: Any, model: Any) -> Entries:
+def _weights(tables: Tables, model: Any) -> Entries:
     """Returns the inverse masses of the rows of constraints."""
     body_weight = model.body_invweight0[:, :1]
     dof_weight = model.dof_invweight0[:, None]
@@ -195,20 +162,9 @@ def _weights(tables: Any, model: Any) -> Entries:
     }
 
 
-def mix(model: Any, pair: GeomPair) -> Mix:
-    """Returns which friction the contacts of a pair of geoms have (mj_contactParam)."""
-    if pair.pair >= 0:
-        return Mix.OF_PAIR
-    first, second = model.geom_priority[[pair.geom1, pair.geom2]]
-    if first == second:
-        return Mix.LARGER
-    if first > second:
-        return Mix.OF_FIRST
-    return Mix.OF_SECOND
-
-
-def _actuators(tables: Any, model: Any, random: Collection[str]) -> Entries:
-    """Returns what actuators have, as ``Tables._actuators``."""
+def _actuators(tables: Tables, model: Any) -> Entries:
+    """Returns what actuators have, as ``actuators.fill``."""
+    random = tables.random
     order = tables.actuator_order
     is_enabled = ~flags.disabled_actuators(tables.model)[:, None]
     is_affine = model.actuator_gaintype[:, None] == _C.mjtGain.mjGAIN_AFFINE
@@ -233,9 +189,9 @@ class Layout:
     places: of the numbers that are drawn, in the order of ``numbers``
     """
 
-    def __init__(self, tables: Any, random: Collection[str]):
+    def __init__(self, tables: Tables):
         """Finds them; the tables have these rows."""
-        shapes = jax.eval_shape(lambda: entries(tables, random, {}))
+        shapes = jax.eval_shape(lambda: entries(tables, {}))
         self.starts: dict[str, int] = {}
         self.base: list[float] = []
         self.places: list[int] = []
@@ -258,18 +214,17 @@ def numbers(parts: Entries) -> jax.Array:
     return jnp.concatenate([empty, *columns])
 
 
-def view(names: Iterable[str], layout: Layout, structs: Mapping[str, str]) -> list[str]:
+def view(names: Iterable[str], layout: Layout) -> list[str]:
     """Returns the C++ of a model some of whose tables are in the state of a team.
 
     Args:
       names: of all members of the struct Fixed.
       layout: of the others.
-      structs: of tables that have rows of several numbers, by their names.
     """
     members = [f"const decltype(Fixed::{name})& {name};" for name in names]
     values = [f"{name}(fixed.{name})" for name in names]
     for name, start in layout.starts.items():
-        struct = structs.get(name, "real")
+        struct = records.STRUCTS.get(name, "real")
         members.append(f"const {struct}* {name};")
         values.append(f"{name}(reinterpret_cast<const {struct}*>(own.drawn + {start}))")
     return [

@@ -12,10 +12,11 @@ import numpy as np
 
 from mjx_reinforce.engine.team.frames import Frame, rotation
 from mjx_reinforce.engine.team.supported import BALL, FREE, pulling_tendons
+from mjx_reinforce.engine.team.tables.store import Tables
 
 _C: Any = mujoco  # a C extension without stubs
 #: The kinds of parts, by ``device/cables.h``.
-_COEFFICIENT, SEGMENT, _WRENCH, _APART, _TWIST, _ANGLE = range(6)
+_COEFFICIENT, _SEGMENT, _WRENCH, _APART, _TWIST, _ANGLE = range(6)
 _ZEROS = (0.0, 0.0, 0.0)
 
 
@@ -67,7 +68,41 @@ class Bound(NamedTuple):
     loss: float = 0.0
 
 
-def of_model(model: Any, frames: Sequence[Frame], parents: Any, quats: Any) -> list[Cable]:
+def fill(tables: Tables) -> None:
+    """Makes the tables of cables."""
+    model = tables.model
+    tables.cables = _of_model(model, tables.frames, tables.parents, tables.reals["link_quat"])
+    parts = [part for cable in tables.cables for part in cable.parts]
+    tables.ints["cable_part"] = np.cumsum([0, *(len(x.parts) for x in tables.cables)])
+    tables.ints["part_kind"] = [x.kind for x in parts]
+    tables.ints["part_on"] = [tables.link_number(x.on) for x in parts]
+    tables.ints["part_off"] = [tables.link_number(x.off) for x in parts]
+    tables.ints["part_body"] = [x.bodies for x in parts]
+    tables.constants["SEGMENTS"] = int(any(x.kind == _SEGMENT for x in parts))
+    tables.ints["part_frame"] = [tables.link_number(x.frame) for x in parts]
+    tables.reals["part"] = [(*x.at, *x.gear) for x in parts]
+    tendons = [_spring(model, x.tendon) for x in tables.cables]
+    is_tense = any(any(x[:6]) for x in tendons)
+    tables.constants["TENDON_FORCES"] = int(is_tense)
+    tables.reals["tendon"] = tendons if is_tense else []
+    tables.constants["NCABLE"] = len(tables.cables)
+
+
+def fill_bounds(tables: Tables) -> None:
+    """Makes the tables of limits and, behind them, of friction loss of cables."""
+    limits, losses = _bounds(tables.model, tables.cables)
+    rows = [*limits, *losses]
+    tables.ints["bound_cable"] = [x.cable for x in rows]
+    tables.ints["bound_soft"] = [tables.softness_number(*x.soft) for x in rows]
+    tables.ints["bound_sides"] = [x.sides for x in limits]
+    tables.reals["bound"] = [x.limit for x in rows]
+    tables.reals["bound_loss"] = [x.loss for x in losses]
+    tables.constants["NLIMITED"] = len(limits)
+    tables.constants["NLOSS"] = len(losses)
+    tables.constants["NE"] += len(rows)
+
+
+def _of_model(model: Any, frames: Sequence[Frame], parents: Any, quats: Any) -> list[Cable]:
     """Returns a model's cables.
 
     Args:
@@ -109,7 +144,7 @@ def _tendon(model: Any, frames: Sequence[Frame], tendon: int) -> Iterable[Part]:
             sites = [model.wrap_objid[after], number]
             ends = [_site(model, frames, site) for site in sites]
             yield Part(
-                kind=SEGMENT,
+                kind=_SEGMENT,
                 on=ends[0].link,
                 off=ends[1].link,
                 at=ends[0].pos,
@@ -170,7 +205,7 @@ def of_actuators(model: Any, types: Sequence[Any], count: int) -> np.ndarray:
     return sums
 
 
-def spring(model: Any, tendon: int) -> tuple[float, ...]:
+def _spring(model: Any, tendon: int) -> tuple[float, ...]:
     """Returns the Tendon of ``device/records.h``; -1 is no tendon, and pulls nothing."""
     if tendon < 0:
         return (0.0,) * 8
@@ -180,7 +215,7 @@ def spring(model: Any, tendon: int) -> tuple[float, ...]:
     return (*stiffness, *damping, *model.tendon_lengthspring[tendon])
 
 
-def bounds(model: Any, cables: Sequence[Cable]) -> tuple[list[Bound], list[Bound]]:
+def _bounds(model: Any, cables: Sequence[Cable]) -> tuple[list[Bound], list[Bound]]:
     """Returns the rows of the limits of cables, and those of their friction loss."""
     limits = []
     losses = []
