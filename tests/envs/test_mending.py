@@ -229,3 +229,10 @@ def test_a_written_model_is_the_model(tmp_path, name):
     assert model.body_mass[-1] == 1
     for field in ("body_mass", "body_inertia", "mesh_vert", "hfield_data", "tex_data"):
         np.testing.assert_array_equal(getattr(read_again, field), getattr(model, field), field)
+
+
+def test_a_motor_keeps_what_it_cannot_be_without():
+    """MuJoCo compiles no DC motor that is not actearly."""
+    motor = '<dcmotor joint="a" motorconst=".1" resistance="1"/>'
+    slide = ARM.format(PART.format("", "a", "box", ""))
+    assert edits.mend(read(slide.replace('<motor joint="a"/>', motor))).edits == []
