@@ -110,8 +110,9 @@ class RunSettings:
         None, Range.POSITIVE, Mark.BUDGET, Mark.NOT_COMPILED, once="it is for one run"
     )
     """Training time of all seeds together, in place of --env-steps. The first updates measure how
-    many env steps fit, and what follows corrects that. config.json keeps these numbers, so --like
-    RUN repeats the run to the bit. The default of most tasks, if no other budget is given."""
+    many env steps fit, and what follows corrects that. A seed with shorter episodes than others may
+    end with fewer. config.json keeps these numbers, so --like RUN repeats the run to the bit. The
+    default of most tasks, if no other budget is given."""
     budgets: tuple[int, ...] = setting(
         (), Mark.BUDGET, Mark.NOT_COMPILED, once="it is measured in one run"
     )

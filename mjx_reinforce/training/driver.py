@@ -298,8 +298,7 @@ class RunDriver(Driver):
         num_updates = self.updates()
         env_steps = self.config.env_steps_at(num_updates)
         if self.deadline is not None and env_steps is not None:
-            mean_steps = float(record.env_steps.mean())
-            new_budget = self.deadline.budget(self.seconds(), mean_steps, env_steps)
+            new_budget = self.deadline.budget(self.seconds(), record.env_steps, env_steps)
             if new_budget is not None:
                 self.config = self.config.with_budget(num_updates, new_budget)
                 env_steps = new_budget

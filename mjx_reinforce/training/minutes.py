@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
+
 from mjx_reinforce.learning import counts
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.training.slots import Slots
@@ -93,7 +95,11 @@ _SHARE = 1 / 8
 
 
 class Deadline:
-    """When a run is to end, which it does by budgets that are found again and again."""
+    """When a run is to end, which it does by budgets that are found again and again.
+
+    A policy whose episodes are shorter than others' needs more updates for as many env steps, and
+    would go on alone. It is ended late by half of a share of the time, with the env steps it has.
+    """
 
     def __init__(self, start: float, end: float, env_steps: float):
         """Begins where a run begins or goes on.
@@ -108,16 +114,22 @@ class Deadline:
         self._due = start + self._interval
         self._last = start, env_steps
 
-    def budget(self, seconds: float, env_steps: float, present_budget: int) -> int | None:
+    def budget(self, seconds: float, env_steps: np.ndarray, present_budget: int) -> int | None:
         """Returns the budget of a policy in env steps, at the speed since the last answer.
 
         None where no answer is due: a share of the time has not passed, or the end is near.
 
         Args:
           seconds: the time (s).
-          env_steps: that the mean policy has played.
+          env_steps: [S] that each policy has played.
           present_budget: of a policy, in env steps.
         """
+        if seconds > self._end + self._interval / 2:
+            return int(env_steps.min())
+        return self._budget_of_mean(seconds, float(env_steps.mean()), present_budget)
+
+    def _budget_of_mean(self, seconds: float, env_steps: float, present_budget: int) -> int | None:
+        """Returns the budget that the mean policy has used when the time is over, or None."""
         last_seconds, last_steps = self._last
         latest_seconds = self._end - self._interval / 2
         if seconds > latest_seconds or env_steps <= last_steps:

@@ -222,11 +222,33 @@ def test_a_run_in_time_ends_in_time(speed_at, first_budget):
     time, env_steps, updates = 10.0, 500.0, 0
     while env_steps < config.env_steps_at(updates):
         time, env_steps, updates = time + 0.5, env_steps + 0.5 * speed_at(time), updates + 5
-        budget = deadline.budget(time, env_steps, config.env_steps_at(updates))
+        budget = deadline.budget(time, np.array([env_steps]), config.env_steps_at(updates))
         if budget is not None:
             config = config.with_budget(updates, budget)
     assert 66.4 < time < 73.6
     assert 8 < len(config.budgets) < 26
+
+
+def test_a_policy_of_short_episodes_does_not_go_on_alone():
+    """Others have used the budget of the mean, by so many updates each, long before it has."""
+    steps_per_second = np.array([1000.0] * 15 + [300.0])
+    config = Config(minutes=1.0).with_budget(0, 60_000)
+    deadline = minutes.Deadline(start=0.0, end=60.0, env_steps=0.0)
+    time, env_steps, updates = 0.0, np.zeros(16), 0
+    while (env_steps < config.env_steps_at(updates)).any():
+        running = env_steps < config.env_steps_at(updates)
+        time, env_steps, updates = (
+            time + 0.5,
+            env_steps + 0.5 * steps_per_second * running,
+            updates + 5,
+        )
+        budget = deadline.budget(time, env_steps, config.env_steps_at(updates))
+        if budget is not None:
+            config = config.with_budget(updates, budget)
+    assert 60 <= time < 66
+    assert env_steps.min() > 15_000
+    # The budgets that config.json keeps end each policy where it ended.
+    assert config.env_steps == int(env_steps.min())
 
 
 def test_budgets_hold_from_their_updates_on_unless_another_is_given():
