@@ -55,8 +55,8 @@ def load_model(xml_file: ModelSource) -> Any:
         ``MjSpec`` or ``MjModel``, of which a copy is taken.
 
     Raises:
-      ValueError: there is no such file, MuJoCo cannot compile it, its timestep is no time, or nothing
-        in it can be moved; then the message has all that ``to_mjx`` refuses, too.
+      ValueError: there is no such file, MuJoCo cannot compile it, its timestep is not positive, or
+        nothing in it can be moved; then the message has all that ``to_mjx`` refuses, too.
     """
     if isinstance(xml_file, MjModel):
         model = copy.copy(xml_file)
