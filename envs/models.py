@@ -55,8 +55,8 @@ def load_model(xml_file: ModelSource) -> Any:
         ``MjSpec`` or ``MjModel``, of which a copy is taken.
 
     Raises:
-      ValueError: there is no such file, MuJoCo cannot compile it, or nothing in it can be moved;
-        then the message has all that ``to_mjx`` refuses, too.
+      ValueError: there is no such file, MuJoCo cannot compile it, its timestep is not positive, or
+        nothing in it can be moved; then the message has all that ``to_mjx`` refuses, too.
     """
     if isinstance(xml_file, MjModel):
         model = copy.copy(xml_file)
@@ -65,6 +65,11 @@ def load_model(xml_file: ModelSource) -> Any:
             # HalfCheetah's total mass is given as Gymnasium gives it, which MuJoCo deprecates.
             warnings.filterwarnings("ignore", ".*'settotalmass' is deprecated")
             model = _compile_model(MjSpec.compile, spec(xml_file), xml_file)
+    if not 0 < model.opt.timestep < np.inf:
+        raise ValueError(
+            f"{_name(xml_file)} has the timestep {model.opt.timestep}; write a finite number of "
+            "seconds above 0"
+        )
     # Said together with all that MJX would refuse, so that the file is mended once.
     if not model.nu:
         fault = "it has no actuators; add an <actuator> element, or call spec.add_actuator"

@@ -127,8 +127,10 @@ def _mend(settings: NewSettings) -> "Mended | None":
 
 def _write_fixed(mended: "Mended", output: Path, overwrite: bool) -> None:
     """Writes a mended model, and says what was changed; ValueError if there is such a file."""
+    from mjx_reinforce.envs.mending import written
+
     check_output(output, overwrite, ".xml")
-    write_bytes(output, mended.spec.to_xml().encode())
+    write_bytes(output, written.text(mended.spec, output.parent).encode())
     print(f"{output}:", *mended.edits, sep="\n  ")
 
 

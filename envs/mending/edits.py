@@ -102,7 +102,11 @@ def _attributes(spec: Any, model: MjModel) -> Iterator[str]:
         yield from _to_joint(spec, actuator)
     for collection, attributes in _REMOVED.items():
         for attribute in attributes:
-            elements = [x for x in getattr(spec, collection) if np.any(getattr(x, attribute))]
+            elements = [
+                x
+                for x in getattr(spec, collection)
+                if np.any(getattr(x, attribute)) and not _needs(x, attribute)
+            ]
             for element in elements:
                 setattr(element, attribute, 0 * getattr(element, attribute))
             if elements:
@@ -116,6 +120,11 @@ def _attributes(spec: Any, model: MjModel) -> Iterator[str]:
     if _C.mjtSensor.mjSENS_RANGEFINDER in model.sensor_type and not model.nmat:
         spec.add_material(name="any")
         yield "a material for rangefinders added"
+
+
+def _needs(element: Any, attribute: str) -> bool:
+    """Returns whether MuJoCo compiles an element only with an attribute."""
+    return attribute == "actearly" and element.dyntype == _C.mjtDyn.mjDYN_DCMOTOR
 
 
 def _to_joint(spec: Any, actuator: Any) -> Iterator[str]:

@@ -276,6 +276,7 @@ WRONG = {
     "arm.xml --output there.py": "there.py exists; pass --overwrite",
     "still.xml": "has no actuators",
     "broken.xml": "MuJoCo cannot compile",
+    "timeless.xml --fix": "has the timestep 0.0; write a finite number of seconds above 0",
 }
 
 
@@ -283,6 +284,7 @@ WRONG = {
 def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments):
     arm = (EXAMPLES / "my_arm.xml").read_text()
     texts = {"arm": arm, "still": "<mujoco/>", "broken": "<mujoco"}
+    texts["timeless"] = arm.replace("<worldbody>", '<option timestep="0"/><worldbody>')
     for name, text in texts.items():
         (tmp_path / f"{name}.xml").write_text(text)
     (tmp_path / "there.py").write_text("")

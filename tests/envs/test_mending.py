@@ -3,9 +3,10 @@
 import mujoco
 import numpy as np
 import pytest
+from PIL import Image
 
 from mjx_reinforce.envs import models, refusals
-from mjx_reinforce.envs.mending import edits, ground
+from mjx_reinforce.envs.mending import edits, ground, written
 
 C = mujoco
 read = mujoco.MjSpec.from_string  # pyright: ignore[reportAttributeAccessIssue]
@@ -26,6 +27,21 @@ ROBOT = """<mujoco><option cone="elliptic"/><asset>
   <geom name="nose" type="cylinder" pos=".3 0 0" size=".03 .03"/>{}{}</body></worldbody>
   <actuator><motor joint="front"/><motor joint="hind"/></actuator>
   <sensor><touch site="s"/></sensor></mujoco>"""
+
+
+#: An arm in a folder of its own, whose shapes collide without a mass.
+LIMB = """<mujoco><compiler meshdir="shapes" texturedir="looks"/>
+  <default><default class="collision"><geom mass="0" density="0"/></default></default>
+  <asset><mesh name="hand" file="hand.obj"/><hfield name="hills" file="hills.png" size="1 1 1 1"/>
+    <texture name="grass" type="2d" file="grass.png"/></asset>
+  <worldbody><geom type="hfield" hfield="hills"/>
+    <body name="arm"><joint axis="0 1 0"/><geom size=".1" pos="1 0 0" mass="1"/>
+    <geom class="collision" type="mesh" mesh="hand"/>
+    <geom class="collision" size=".1" density="300"/></body></worldbody></mujoco>"""
+ASSEMBLED = """<mujoco><asset><model name="arm" file="robots/arm/arm.xml"/></asset>
+  <worldbody><attach model="arm" body="arm" prefix="left/"/>
+  <frame pos="0 1 0"><attach model="arm" prefix="right/"/></frame></worldbody></mujoco>"""
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
 
 def robot(foot):
@@ -191,3 +207,32 @@ def test_boxes_on_boxes_lose_their_margin():
         "margin and gap removed from geom 0 of body number 1, geom 0 of body cube"
     ]
     assert refusals.best_in_c(mended.spec.compile()) is None
+
+
+@pytest.mark.parametrize("name", ["scene.xml", "robots/arm/arm.xml"])
+def test_a_written_model_is_the_model(tmp_path, name):
+    """With the files of a model that it attaches, and with what has no mass."""
+    arm = tmp_path / "robots" / "arm"
+    for folder in ("shapes", "looks"):
+        (arm / folder).mkdir(parents=True)
+    (arm / "arm.xml").write_text(LIMB)
+    (arm / "shapes" / "hand.obj").write_text(TETRAHEDRON)
+    for picture in ("shapes/hills.png", "looks/grass.png"):
+        Image.fromarray(np.arange(16, dtype=np.uint8).reshape(4, 4)).save(arm / picture)
+    (tmp_path / "scene.xml").write_text(ASSEMBLED)
+    path = tmp_path / name
+    spec = C.MjSpec.from_file(str(path))
+    model = spec.compile()
+    copy = path.with_name("copy.xml")
+    copy.write_text(written.text(spec, copy.parent))
+    read_again = C.MjModel.from_xml_path(str(copy))
+    assert model.body_mass[-1] == 1
+    for field in ("body_mass", "body_inertia", "mesh_vert", "hfield_data", "tex_data"):
+        np.testing.assert_array_equal(getattr(read_again, field), getattr(model, field), field)
+
+
+def test_a_motor_keeps_what_it_cannot_be_without():
+    """MuJoCo compiles no DC motor that is not actearly."""
+    motor = '<dcmotor joint="a" motorconst=".1" resistance="1"/>'
+    slide = ARM.format(PART.format("", "a", "box", ""))
+    assert edits.mend(read(slide.replace('<motor joint="a"/>', motor))).edits == []
