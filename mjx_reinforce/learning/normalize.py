@@ -111,15 +111,8 @@ def _m2_of_long_count(
 
 
 def between(old_normalizer: Normalizer, new_normalizer: Normalizer, share: jax.Array) -> Normalizer:
-    """Returns the statistics that a share [] of the way leads to; 1 leads to ``new_normalizer``.
-
-    Before the first observation the scale is 1, and it moves from there.
-    """
+    """Returns the statistics a share [] of the way; 1 leads to ``new_normalizer``."""
     blend = jax.tree.map(lambda old, new: old + share * (new - old), old_normalizer, new_normalizer)
-    # The variance goes from 1 to the first one; m2 is the count times that.
-    variance = new_normalizer.m2 / jnp.maximum(new_normalizer.count, 1.0)
-    first_m2 = blend.count * (1.0 + share * (variance - 1.0))
-    blend = blend.replace(m2=jnp.where(old_normalizer.count > 0, blend.m2, first_m2))
     # old + 1 * (new - old) is not new in floating point.
     return jax.tree.map(lambda old, new: jnp.where(share < 1.0, old, new), blend, new_normalizer)
 

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 
 from mjx_reinforce.engine.episode import while_any
 from mjx_reinforce.learning import normalize
@@ -45,6 +44,10 @@ def within_kl(
     too far, or far less than it may, shares are tried between those that are known to be too small
     and too large, in the logarithm of the share. Its direction stays.
 
+    The first scale of the observations is not learned: it comes whole, and the limit is that of
+    the other changes. A share of it would remain where ``normalize_steps`` are fewer than the first
+    update's: no later update would bring the rest.
+
     Args:
       policy: whose actor changes.
       old_actor: the actor that played.
@@ -54,11 +57,17 @@ def within_kl(
 
     Returns:
       An actor within the limit, to a hundredth of it. Where no share of the change is, its
-      parameters are NaN, for ``keep_finite`` to see; but an untrained policy, whose observations
-      were not scaled so far, takes the first scale and nothing else.
+      parameters are NaN, for ``keep_finite`` to see.
     """
     if max_kl is None:
         return new_actor
+    is_unscaled = old_actor.normalizer.count == 0
+    first_normalizer = jax.tree.map(
+        lambda old, new: jnp.where(is_unscaled, new, old),
+        old_actor.normalizer,
+        new_actor.normalizer,
+    )
+    old_actor = old_actor.replace(normalizer=first_normalizer)
     old = act(policy, old_actor, visited.observation)
 
     def actor_at(share: jax.Array) -> Actor:
@@ -69,7 +78,6 @@ def within_kl(
 
         return Actor(
             params=jax.tree.map(blend, old_actor.params, new_actor.params),
-            # Not by ``blend``: before the first observation the scale is 1, not that of zeros.
             normalizer=normalize.between(old_actor.normalizer, new_actor.normalizer, share),
         )
 
@@ -85,17 +93,7 @@ def within_kl(
     share = jnp.where(share > _MIN_SHARE, share, _MIN_SHARE**0.5)
     first_share = jnp.where(full_kl <= max_kl, 1.0, share)
     share = _share_within(lambda share: kl_of(actor_at(share)), first_share, max_kl)
-    limited_actor = actor_at(share)
-
-    # The first scale also clips, which no share of it does less. It then comes alone and whole.
-    first_scale = (
-        jnp.isnan(share) & (old_actor.normalizer.count == 0) & (new_actor.normalizer.count > 0)
-    )
-    first_scale &= jnp.all(jnp.isfinite(ravel_pytree(new_actor.params)[0]))
-    params = jax.tree.map(
-        lambda old, new: jnp.where(first_scale, old, new), old_actor.params, limited_actor.params
-    )
-    return limited_actor.replace(params=params)
+    return actor_at(share)
 
 
 class _Search(NamedTuple):
