@@ -32,7 +32,10 @@ PARTS = {f"envs.parts.{name}": getattr(parts, name) for name in parts.__all__}
 #: Comment before a block that no test runs, with the reason.
 NOT_RUN = "<!-- not run: "
 #: Examples of docstrings that compile or train for seconds.
-LONG_EXAMPLES = {"Cut", "Evaluation", "RunResults", "SweepResults", "envs.for_brax", "sweep"}
+LONG_EXAMPLES = {
+    *("Cut", "Evaluation", "RunResults", "SweepResults", "envs.for_brax", "full_batch"),
+    *("load_policy", "natural_gradient", "run", "sweep"),
+}
 
 
 def page(name):

@@ -8,6 +8,7 @@ import re
 import tokenize
 
 import mujoco
+import pytest
 import style
 from places import ROOT
 from sizes import package_files
@@ -77,6 +78,7 @@ def prose(path):
                 yield token.start[0], code
 
 
+@pytest.mark.slow
 def test_names_in_double_backticks_exist():
     """Somewhere in the code; of a module and a class of ours, there."""
     paths = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*")]
@@ -115,6 +117,7 @@ def test_names_of_the_code_are_nouns():
     assert vague == {}
 
 
+@pytest.mark.slow
 def test_the_code_reads_plainly():
     """``python tests/helpers/style.py FOLDER`` prints the places."""
     counts = style.measure(package_files(ROOT, ".py"))

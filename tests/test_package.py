@@ -172,6 +172,7 @@ def test_lines_of_cpp_fit():
     assert lines == []
 
 
+@pytest.mark.slow
 def test_no_size_is_above_its_ceiling():
     """Each size that has a ceiling is at most that ceiling."""
     ceilings = tomllib.loads((TESTS / "ceilings.toml").read_text("utf-8"))
@@ -241,6 +242,7 @@ def test_what_reads_a_command_line_is_light(command):
     assert loaded.strip() == "False"
 
 
+@pytest.mark.slow
 def test_pages_films_and_logs_wait():
     """What draws and logs is imported when something is drawn or logged."""
     late = ("vl_convert", "jinja2", "tensorboardX", "matplotlib", "PIL")

@@ -391,6 +391,7 @@ def test_text_is_not_read_as_markup(capsys):
     assert capsys.readouterr().out.count(text) == 4
 
 
+@pytest.mark.slow
 def test_an_ascii_terminal_shows_escapes(tmp_path):
     accent = "é日本\U0001f916"
     code = (
@@ -410,6 +411,7 @@ def test_an_ascii_terminal_shows_escapes(tmp_path):
     assert done.stderr.decode("ascii").startswith("error: unknown environment")
 
 
+@pytest.mark.slow
 def test_help_may_be_cut_off_or_go_nowhere():
     """As by ``--help | head``."""
     ways = ["| true", ">&-", "> /dev/full", "2>&- >&-"]

@@ -79,6 +79,7 @@ def test_names_of_a_model_cannot_break_the_class(tmp_path, monkeypatch):
     assert r'data.joint("say \"it\"\\").qpos' in (tmp_path / "sensed.py").read_text()
 
 
+@pytest.mark.slow
 def test_a_walker_starts_in_its_key_frame(tmp_path, monkeypatch):
     """It sees no place on the floor, speed pays, and a fall ends it."""
     key = '<keyframe><key qpos="0 0 .2 .6 0 .8 0 -1" ctrl="-.5"/></keyframe></mujoco>'

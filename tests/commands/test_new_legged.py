@@ -216,6 +216,7 @@ def test_terms_sum_to_the_reward(dog, episodes):
     np.testing.assert_allclose(episodes["reward_pose"][1:], poses, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("height", "quaternion", "falls"),
     [

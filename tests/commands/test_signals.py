@@ -185,6 +185,7 @@ def test_a_signal_before_training_is_answered(tmp_path):
     assert process.returncode == 130
 
 
+@pytest.mark.slow
 def test_files_are_cleaned_up_however_long_it_takes_but_the_screen_is_not_waited_for(tmp_path):
     command = [sys.executable, "-c", SLOW_EXIT]
     process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True)

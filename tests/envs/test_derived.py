@@ -160,6 +160,7 @@ def test_constants_are_those_that_mujoco_computes(float64, name, simple):
     assert bool(constants) == (name in (*derived.READ, "all"))
 
 
+@pytest.mark.slow
 def test_what_nothing_reads_is_not_derived():
     """Without rows, muscles, sensors and cameras the start of an episode is as short as before."""
     source = """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1"/></body>

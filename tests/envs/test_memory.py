@@ -196,6 +196,7 @@ def test_noise_differs_from_step_to_step_and_has_its_deviation(env):
     assert commands.mean() == pytest.approx(0.5, abs=0.04)
 
 
+@pytest.mark.slow
 def test_a_push_changes_the_velocity_with_which_a_step_begins(env):
     """After ``PERIOD`` steps the body is pushed, in the next step."""
     state = env.reset(jax.random.key(2))

@@ -159,6 +159,7 @@ def test_speeds_of_a_gpu_are_beside_what_teams_cover(tmp_path, monkeypatch):
     assert "| Menagerie's robots | 3 | 2 | not timed |" in gpu.summary(untimed)
 
 
+@pytest.mark.slow
 def test_a_robot_of_the_gpus_rows_plays(tmp_path):
     (tmp_path / "model.xml").write_text(MODEL.format(option="", actuator=MOTOR))
     env = make(gpu.task_of(tmp_path / "model.xml"))

@@ -112,6 +112,7 @@ def test_the_rates_are_not_chosen_on_the_seeds_that_are_reported(tasks):
     assert effect.rates == ((3e-3, 3e-2), (3e-3, 3e-2))
 
 
+@pytest.mark.slow
 def test_the_tables_say_what_the_numbers_are(tasks, tmp_path, monkeypatch):
     monkeypatch.setattr(seeds_few, "_DRAWS", 20)
     for task in tasks:

@@ -93,6 +93,7 @@ def test_the_noise_of_all_episodes_is_the_sample_variance_of_their_mean():
     assert float(got) == pytest.approx((np.sum(mean**2) - noise) / noise, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_the_noise_is_that_of_some_episodes_beside_the_mean_of_all():
     """Of 65 episodes that of two; see ``updates.signal_to_noise``."""
     mask = np.arange(5)[:, None] < np.random.default_rng(1).integers(1, 6, 65)

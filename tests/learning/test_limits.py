@@ -125,8 +125,7 @@ def test_the_limit_counts_the_new_scale_of_the_observations(unit):
     assert scale == pytest.approx(np.std(np.concatenate(seen)), rel=0.3)  # held back, it arrives
 
 
-@pytest.mark.parametrize("rate", [1e-3, 1e3])
-def test_the_first_scale_comes_whole_however_far_the_update_goes(rate):
+def test_the_first_scale_comes_whole_where_the_update_is_shortened():
     """One update has more than --normalize-steps observations, and so no later one is counted."""
     learner = reinforce(
         Far(5.0),
@@ -134,12 +133,17 @@ def test_the_first_scale_comes_whole_however_far_the_update_goes(rate):
         num_episodes=3,
         max_kl=LIMIT,
         normalize_steps=1,
-        optimizer=optax.sgd(rate),
+        optimizer=optax.sgd(1e3),
         engine="vmap",
     )
-    state = learner.init(jax.random.key(1))
-    played = learner.play(state, jax.random.key(2))
-    after, metrics = learner.learn(state, played, jax.random.key(3))
+
+    @jax.jit
+    def update(state):
+        played = learner.play(state, jax.random.key(2))
+        return played, *learner.learn(state, played, jax.random.key(3))
+
+    state = jax.jit(learner.init)(jax.random.key(1))
+    played, after, metrics = update(state)
     assert metrics["skipped_update"] == 0
     seen = np.asarray(played.observation)[np.asarray(played.mask & ~played.nonfinite)]
     assert after.actor.normalizer.count == len(seen)
@@ -149,9 +153,7 @@ def test_the_first_scale_comes_whole_however_far_the_update_goes(rate):
     # The limit is that of the parameters, both seen in the new scale.
     unlearned = state.actor.replace(normalizer=after.actor.normalizer)
     each = exact_kl("normal", learner.policy, unlearned, after.actor, played.observation)
-    kl = visited_mean(each, played.mask)
-    assert kl <= 1.02 * LIMIT
-    assert kl >= 0.4 * LIMIT or rate == 1e-3
+    assert 0.4 * LIMIT <= visited_mean(each, played.mask) <= 1.02 * LIMIT
 
 
 def test_a_share_of_the_scale_lies_between():
@@ -266,6 +268,7 @@ def test_rewards_of_any_size_teach_the_same():
             np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_gradient_that_overflows_is_a_skipped_update():
     """Without a division of the weights nothing can be learned from such rewards; it is counted."""
     change, metrics = learned(1e30, None)

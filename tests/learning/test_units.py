@@ -153,6 +153,7 @@ def far_out(policy):
     return policy._replace(init=init)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["reinforce", "ars"])
 def test_evaluations_are_clipped_and_training_is_not(algorithm):
     family = mr.normal if algorithm == "reinforce" else mr.deterministic

@@ -36,6 +36,7 @@ def test_an_evaluation_has_the_mean_sum_of_each_term():
     assert not [name for name in alone if "reward" in name]  # a sweep records returns
 
 
+@pytest.mark.slow
 def test_a_term_of_a_broken_episode_says_nothing():
     learner = mr.reinforce(Paid(), num_episodes=2)
     actor = learner.init(jax.random.key(0)).actor

@@ -30,6 +30,7 @@ def test_a_schedule_may_be_of_any_length_that_is_counted(length):
             assert schedules.share(clock, env_steps) == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_step_counts_over_the_end_of_an_int32():
     """The learning rate of a run of 2^33 steps falls with them."""
     rate = schedules.decay_rate(0.0, 2**33)

@@ -111,6 +111,7 @@ def test_entries_without_bounds_are_as_they_are():
     np.testing.assert_array_equal(state.obs, expected.obs)
 
 
+@pytest.mark.slow
 def test_a_task_of_ours():
     """It has the attributes of the task, and the terms of the reward are summed by episode."""
     env = envs.for_brax("InvertedPendulum-v5")

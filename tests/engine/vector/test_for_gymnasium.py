@@ -97,6 +97,7 @@ def test_a_seed_of_one_is_that_of_its_environment(cart):
     np.testing.assert_array_equal(own.reset(seed=4)[0], own.reset(seed=[4, 5, 6])[0])
 
 
+@pytest.mark.slow
 def test_without_autoreset_what_has_ended_is_reset_first():
     """As in Gymnasium, which raises an AssertionError."""
     make = {"num_envs": 2, "autoreset": "disabled", "max_episode_steps": 3}
