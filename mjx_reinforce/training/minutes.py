@@ -124,22 +124,21 @@ class Deadline:
           env_steps: [S] that each policy has played.
           present_budget: of a policy, in env steps.
         """
+        last_seconds, last_steps = self._last
+        mean_steps = float(env_steps.mean())
+        latest_seconds = self._end - self._interval / 2
+        if mean_steps <= last_steps:
+            return None
         if seconds > self._end + self._interval / 2:
             return int(env_steps.min())
-        return self._budget_of_mean(seconds, float(env_steps.mean()), present_budget)
-
-    def _budget_of_mean(self, seconds: float, env_steps: float, present_budget: int) -> int | None:
-        """Returns the budget that the mean policy has used when the time is over, or None."""
-        last_seconds, last_steps = self._last
-        latest_seconds = self._end - self._interval / 2
-        if seconds > latest_seconds or env_steps <= last_steps:
+        if seconds > latest_seconds:
             return None
-        speed = (env_steps - last_steps) / (seconds - last_seconds)
+        speed = (mean_steps - last_steps) / (seconds - last_seconds)
         # A budget that is nearly used, too early, does not wait until the share has passed.
-        is_near = env_steps >= (1 - _SHARE) * present_budget
-        is_early = is_near and seconds + (present_budget - env_steps) / speed < latest_seconds
+        is_near = mean_steps >= (1 - _SHARE) * present_budget
+        is_early = is_near and seconds + (present_budget - mean_steps) / speed < latest_seconds
         if seconds < self._due and not is_early:
             return None
         self._due = seconds + self._interval
-        self._last = seconds, env_steps
-        return min(round(env_steps + speed * (self._end - seconds)), MAX_COUNT)
+        self._last = seconds, mean_steps
+        return min(round(mean_steps + speed * (self._end - seconds)), MAX_COUNT)

@@ -251,6 +251,12 @@ def test_a_policy_of_short_episodes_does_not_go_on_alone():
     assert config.env_steps == int(env_steps.min())
 
 
+def test_a_run_whose_trial_took_all_of_the_time_makes_an_update():
+    deadline = minutes.Deadline(start=0.0, end=1.0, env_steps=500.0)
+    assert deadline.budget(9.0, np.array([500, 500]), 501) is None
+    assert deadline.budget(10.0, np.array([900, 700]), 501) == 700
+
+
 def test_budgets_hold_from_their_updates_on_unless_another_is_given():
     config = Config(minutes=2.0).with_budget(0, 100).with_budget(20, 300)
     assert (config.minutes, config.env_steps, config.budgets) == (None, 300, (0, 100, 20, 300))

@@ -20,7 +20,7 @@ from experiments.checks import contacts
 from experiments.kit import device_code
 from experiments.kit.device_code import compiled as _compiled
 from mjx_reinforce.engine.scalar import UnsupportedPrimitive
-from mjx_reinforce.engine.team import tables
+from mjx_reinforce.engine.team import supported, tables
 from mjx_reinforce.envs import models
 
 _C: Any = mujoco
@@ -291,7 +291,7 @@ def test_lanes_share_islands(limits, tmp_path):
 def test_pairs_whose_parts_are_many_are_whole(feature, lanes, tmp_path, monkeypatch):
     (name,) = [x for x in _MODELS["features"] if x.startswith(feature)]
     m = _model(**_MODELS["features"][name])
-    monkeypatch.setattr(tables.supported, "MAX_ITEMS", 30)
+    monkeypatch.setattr(supported, "MAX_ITEMS", 30)
     assert "WHOLE_PAIRS = 1" in tables.physics_text(m)
     assert _largest_error(_exact(m), tmp_path, skip=3, starts=1, lanes=lanes) < 1e-9
 
