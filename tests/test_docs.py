@@ -31,11 +31,6 @@ TASKS = {f"envs.{name}": getattr(envs, name) for name in TASK_NAMES}
 PARTS = {f"envs.parts.{name}": getattr(parts, name) for name in parts.__all__}
 #: Comment before a block that no test runs, with the reason.
 NOT_RUN = "<!-- not run: "
-#: Examples of docstrings that compile or train for seconds.
-LONG_EXAMPLES = {
-    *("Cut", "Evaluation", "RunResults", "SweepResults", "envs.for_brax", "full_batch"),
-    *("load_policy", "natural_gradient", "run", "sweep"),
-}
 
 
 def page(name):
@@ -50,13 +45,8 @@ def blocks(text, language):
     return [code for excuse, code in found if not excuse]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=[pytest.mark.slow] if name in LONG_EXAMPLES else [])
-        for name in (*PUBLIC, *TASKS)
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*PUBLIC, *TASKS])
 def test_example_runs(name, monkeypatch):
     """Every public name has an example in its docstring, and it gives what it says."""
     monkeypatch.setattr(envs, "_TABLE", dict(envs._TABLE))  # one adds a task

@@ -106,6 +106,7 @@ def test_names_in_double_backticks_exist():
     assert missing == []
 
 
+@pytest.mark.slow
 def test_names_of_the_code_are_nouns():
     """In every folder, of a hundred names at most 1.5 are pronouns, participles, or the like."""
     vague = {}

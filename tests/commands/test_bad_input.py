@@ -215,6 +215,7 @@ def own(monkeypatch, tmp_path):
     return lambda text: (tmp_path / "own_broken.py").write_text(OWN + text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("text", "message"), WRONG_MODULES)
 def test_a_module_with_a_mistake_is_refused(refused, own, text, message):
     own(text)

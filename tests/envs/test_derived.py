@@ -134,6 +134,7 @@ def float64():
         yield
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("simple", ["auto", "false"])
 @pytest.mark.parametrize("name", DRAWN)
 def test_constants_are_those_that_mujoco_computes(float64, name, simple):

@@ -248,6 +248,7 @@ def test_a_task_without_memory_has_the_state_it_had():
     assert len(jax.tree.leaves(state)) == 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "result", "message"),
     [

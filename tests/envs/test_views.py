@@ -362,6 +362,7 @@ class Slider(MujocoEnv):
         return jnp.abs(data.qvel[0]), False, {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 @UNSTABLE
 def test_a_step_in_which_c_resets_earns_no_number(case, in_a_folder):

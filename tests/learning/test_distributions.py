@@ -140,6 +140,7 @@ def test_one_vector_and_many_entries(name):
     assert distribution.mode(outputs).shape == (3,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(DISTRIBUTIONS))
 def test_the_fused_engine_writes_out_sample_and_mode(name):
     space = ARMS if name in DISCRETE else SPACE
@@ -211,8 +212,9 @@ def test_truncated_normal_against_scipy(std, distance):
             assert float(got) == pytest.approx(expected.entropy(), abs=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("distance", [pytest.param(-1e6, marks=pytest.mark.slow), 1e4])
+@pytest.mark.parametrize("distance", [-1e6, 1e4])
 def test_truncated_normal_far_out_is_exponential(distance, dtype):
     """With rate c / std from the nearer bound, up to a relative 1 / c^2."""
     with jax.enable_x64(dtype == np.float64):

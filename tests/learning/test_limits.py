@@ -170,6 +170,7 @@ def test_a_share_of_the_scale_lies_between():
     assert normalize.between(old, new, jnp.float32(1.0)).mean == new.mean
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("std", [0.05, 0.5, 5.0])
 @pytest.mark.parametrize("mean", [0.3, -2.0, 9.0])
 def test_the_divergence_of_truncated_normals_is_the_integral(mean, std):

@@ -81,6 +81,7 @@ class Hopeless(Tempting):
         return super().step(state, jnp.ones(1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("increment", [None, increment])
 @pytest.mark.parametrize(("env", "broken"), [(Constant(), 0), (Hopeless(), 16)])
 def test_equal_returns_and_episodes_that_all_broke_teach_nothing(env, broken, increment):

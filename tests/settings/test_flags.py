@@ -78,6 +78,7 @@ def test_an_empty_value_is_no_current_folder(words):
         read(*words)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "word", "value"),
     [

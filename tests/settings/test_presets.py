@@ -91,6 +91,7 @@ def test_network_outputs_mean_what_they_do_in_the_program(name, std):
         assert float(moved[0]) == pytest.approx(0.3 + 2 * std(-0.7), rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["baseline-truncated-normal", "gymnasium-tutorial"])
 def test_first_weights_are_pytorchs(name):
     """Uniform within 1 / sqrt(fan-in), biases too; the critic's as well."""
