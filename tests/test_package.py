@@ -235,6 +235,7 @@ def test_the_engine_stands_by_itself():
     assert (instant, others, ours) == ("False", "[]", "[]")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["train", "runs.command_line", "export.__main__", "new"])
 def test_what_reads_a_command_line_is_light(command):
     """So that --help, and what is refused, take no second."""
@@ -255,6 +256,7 @@ def test_pages_films_and_logs_wait():
     assert loaded.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_every_public_name_exists():
     run("import mjx_reinforce as m\nfor name in m.__all__: getattr(m, name)")
 

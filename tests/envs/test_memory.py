@@ -222,6 +222,7 @@ def test_environments_in_lockstep_begin_episodes_with_a_memory_of_their_own(env)
     assert not np.isin(np.asarray(state.obs[:, 2]), commands).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["vmap", "mujoco"])
 def test_keys_of_every_generator_begin_a_memory(env, engine):
     task = env.in_c_mujoco() if engine == "mujoco" else env

@@ -141,9 +141,10 @@ def test_formulas_are_gymnasiums(id, settings):
     assert ends == ({True, False} if falls and "terminate_when_unhealthy" not in settings else {0})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "id",
-    [pytest.param(id, marks=pytest.mark.slow) if id == "Pusher-v5" else id for id in CASES],
+    CASES,
 )
 def test_starts_are_spread_as_gymnasiums(id):
     """So wide in each entry, and uniform or normal."""

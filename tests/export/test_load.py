@@ -230,6 +230,7 @@ DAMAGE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DAMAGE)
 def test_damage_is_named_in_one_line(tmp_path, monkeypatch, capsys, name):
     """By ``load`` and both command lines, before anything is compiled."""

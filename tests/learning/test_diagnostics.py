@@ -51,6 +51,7 @@ def test_of_many_steps_each_stands_for_its_neighbors(monkeypatch):
     np.testing.assert_allclose(weight.sum(axis=0), [10 / 12, 2 / 12], rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_episodes", [1, 40, 64, 65, 1000])
 def test_no_more_steps_than_promised_are_visited(num_episodes):
     visited = diagnostics.visited_steps(make_trajectory([300] * num_episodes, 300, np.nan))

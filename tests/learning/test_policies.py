@@ -13,6 +13,7 @@ from mjx_reinforce.learning.distributions import normal_softplus
 SPACE = Box(np.array([-1.0, -2.0]), np.array([1.0, 2.0]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hidden_sizes", [(), (5, 3, 4)])
 @pytest.mark.parametrize("initializer", ["orthogonal", "torch"])
 def test_initial_weights_and_biases(hidden_sizes, initializer):

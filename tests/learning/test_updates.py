@@ -193,6 +193,7 @@ def clock(progress=0.0, env_steps=0.0):
     return updates.Clock(jnp.asarray(progress), jnp.asarray(env_steps))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "length"),
     [("full-batch", None), ("full-batch", 10), ("minibatches", None), ("each-step", 10)],

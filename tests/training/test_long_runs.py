@@ -78,7 +78,8 @@ def test_a_run_passes_2_to_31_and_goes_on_there(run, tmp_path, monkeypatch):
         assert any(returns[name].max() == counted[-1] for name in returns.files)
 
 
-@pytest.mark.parametrize("length", [pytest.param(2**31, marks=pytest.mark.slow), 10**12])
+@pytest.mark.slow
+@pytest.mark.parametrize("length", [2**31, 10**12])
 def test_the_scale_may_be_of_as_many_steps_as_a_run(length):
     """A whole number beyond 2^31 ended in an OverflowError, and --normalize-steps took none."""
     check(Config(normalize_steps=length))

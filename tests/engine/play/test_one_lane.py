@@ -80,7 +80,8 @@ def _own_act(actor, observation):
     return 0.1 * jnp.tanh(units @ mix.T) @ mix[:, :2]
 
 
-@pytest.mark.parametrize("act", [None, pytest.param(_own_act, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("act", [None, _own_act])
 def test_the_device_code_plays_as_c_does(act):
     env = Sled()
     engine, episodes = _episodes("auto", env, act=act)
