@@ -142,10 +142,7 @@ def test_formulas_are_gymnasiums(id, settings):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "id",
-    CASES,
-)
+@pytest.mark.parametrize("id", CASES)
 def test_starts_are_spread_as_gymnasiums(id):
     """So wide in each entry, and uniform or normal."""
     env, peer = envs.make(id), peer_of(id)
