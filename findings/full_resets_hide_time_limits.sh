@@ -31,11 +31,13 @@ def last(full_reset):
     for _ in range(5):
         state = step(state, jnp.zeros((1, envs.action_size)))
     info = state.info
-    told = (state.done, info["truncation"], info["episode_done"], info["episode_metrics"]["sum_reward"])
-    return [round(float(x[0]), 2) for x in told]
+    episode_return = info["episode_metrics"]["sum_reward"]
+    values = (state.done, info["truncation"], info["episode_done"], episode_return)
+    return [round(float(x[0]), 2) for x in values]
 
 
-cached, full = last(False), last(True)
+cached = last(False)
+full = last(True)
 print("done, truncation, episode_done, return:", cached, "with full_reset:", full)
 assert cached[:3] == [1, 1, 1] and cached[3] > 4
 assert full == [1, 0, 0, 0]

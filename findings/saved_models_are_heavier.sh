@@ -24,24 +24,24 @@ PENDULUM = """<mujoco>
 </mujoco>"""
 
 
-def described(model):
+def description(model):
     """Returns the mass (kg) and the angular acceleration (rad/s2) of a level pendulum."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     return round(float(model.body_mass[1]), 3), round(float(data.qacc[0]), 3)
 
 
-def both(of_class, of_geom=""):
-    """Returns what describes a model, and what describes the model that is saved and loaded."""
+def descriptions(of_class, of_geom=""):
+    """Returns the description of a model, and that of the model that is saved and loaded."""
     model = mujoco.MjModel.from_xml_string(PENDULUM.format(of_class=of_class, of_geom=of_geom))
     mujoco.mj_saveLastXML(sys.argv[1], model)
-    return described(model), described(mujoco.MjModel.from_xml_path(sys.argv[1]))
+    return description(model), description(mujoco.MjModel.from_xml_path(sys.argv[1]))
 
 
-made, saved = both('mass="0" density="0"')
-print(f"mujoco {mujoco.__version__}: {made} as it is, {saved} saved and loaded")
-assert made[0] == 1 and made[1] < 10
-assert saved[0] > 5 and saved[1] > 14
-for kept in (both('mass="0"'), both('density="0"'), both("", 'mass="0" density="0"')):
-    assert kept[0] == kept[1] == made, kept
+original, reloaded = descriptions('mass="0" density="0"')
+print(f"mujoco {mujoco.__version__}: {original} as it is, {reloaded} saved and loaded")
+assert original[0] == 1 and original[1] < 10
+assert reloaded[0] > 5 and reloaded[1] > 14
+for of_class, of_geom in (('mass="0"', ""), ('density="0"', ""), ("", 'mass="0" density="0"')):
+    assert descriptions(of_class, of_geom) == (original, original), (of_class, of_geom)
 PROGRAM

@@ -23,22 +23,23 @@ def text(spec: MjSpec, folder: Path) -> str:
     MuJoCo's ``to_xml`` forgets two things: the folder of files that an attached model names, and
     that a geom has no mass if a default class says so by both its mass and its density.
     """
-    changed: Any = spec
-    model = changed.compile()
-    for geom in changed.geoms:
+    mj_spec: Any = spec
+    model = mj_spec.compile()
+    for geom in mj_spec.geoms:
         default = geom.classname.geom
         if default.mass == 0:
             default.density = _DENSITY
     paths: dict[str, str] = {}
     for elements, addresses, directory in _FILES:
-        start = folder / getattr(changed, directory)
-        for element in getattr(changed, elements):
+        start = folder / getattr(mj_spec, directory)
+        for element in getattr(mj_spec, elements):
             if element.file:
-                path = model.paths[getattr(model, addresses)[element.id] :].split(b"\0")[0].decode()
+                address = getattr(model, addresses)[element.id]
+                path = os.path.abspath(model.paths[address:].split(b"\0")[0].decode())
                 # MuJoCo reads the file once more, from where it is, before it writes.
-                element.file = path = os.path.abspath(path)
+                element.file = path
                 paths[path] = os.path.relpath(path, start)
-    mjcf = changed.to_xml()
+    mjcf = mj_spec.to_xml()
     for path, relative in paths.items():
         mjcf = mjcf.replace(f'file="{path}"', f'file="{relative}"')
     return mjcf

@@ -5,6 +5,7 @@ import datetime
 import os
 import platform
 import subprocess
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,11 @@ def commit() -> str:
 def threads() -> int:
     """Returns how many threads this process may use at once."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def shared_clock() -> float:
+    """Returns the seconds that this process's threads have computed, divided by their number."""
+    return time.process_time() / threads()
 
 
 def machine() -> str:

@@ -173,7 +173,7 @@ def test_what_nothing_reads_is_not_derived():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["native", "mujoco"])
+@pytest.mark.parametrize("engine", ["vmap", "native", "mujoco"])
 def test_episodes_are_those_of_models_compiled_with_what_was_drawn(float64, engine):
     """Each draws another field; without the constants that follow, C ends elsewhere."""
     env, num_steps = Mechanism(), 15

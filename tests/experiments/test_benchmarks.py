@@ -5,8 +5,8 @@ import time
 
 import pytest
 
+from experiments.kit import rows as kit_rows
 from experiments.kit.rows import threads
-from experiments.speed.benchmark import __main__ as benchmark
 from experiments.speed.benchmark import rows, tables
 from experiments.speed.benchmark.peers import c_mujoco
 
@@ -72,8 +72,8 @@ def test_a_busy_machine_counts_what_is_computed(monkeypatch):
     """Not the seconds that pass: 3 s of two threads together are 1.5 s."""
     seconds = itertools.count(0.0, 3.0)
     monkeypatch.setattr(time, "process_time", lambda: next(seconds))
-    monkeypatch.setattr(benchmark, "threads", lambda: 2)
-    (row,) = rows.measure([rows.Candidate(ROW, lambda: None, 6)], 1, benchmark.shared_clock)
+    monkeypatch.setattr(kit_rows, "threads", lambda: 2)
+    (row,) = rows.measure([rows.Candidate(ROW, lambda: None, 6)], 1, kit_rows.shared_clock)
     assert rows.speed(row) == 4
 
 

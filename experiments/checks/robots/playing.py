@@ -12,7 +12,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from experiments.checks.robots.models import Start, start_of
-from experiments.speed.benchmark.__main__ import shared_clock
+from experiments.kit.rows import shared_clock
 from mjx_reinforce import make_vec
 from mjx_reinforce.engine.memory import num_cores
 from mjx_reinforce.engine.play.choice import ActingPolicy, choose
@@ -274,8 +274,8 @@ def optimum(model: Any) -> Any:
 def speed(model: Any) -> dict[str, Any]:
     """Returns the env steps a second of training's rollout beside those of a bare ``Batch``.
 
-    Both take turns, and what counts is the median over turns: by the first of ``_clocks``, and of
-    the ratio by the other one, too.
+    Both take turns, and each number is a median over turns. The speed counts the first of
+    ``_clocks``; the ratio has a value for each of the two.
     """
     start = start_of(model)
     policy = policy_of(start, model.opt.timestep)
@@ -299,9 +299,9 @@ def speed(model: Any) -> dict[str, Any]:
 
     ours()
     seconds = time.perf_counter() - start_time
-    paces = [(ours(), bare(horizon)) for _ in range(_MEASUREMENTS)]
-    rate, _ = np.median([own for own, _ in paces], axis=0)
-    ratios = np.median([own / other for own, other in paces], axis=0)
+    rates = [(ours(), bare(horizon)) for _ in range(_MEASUREMENTS)]
+    rate, _ = np.median([rate for rate, _ in rates], axis=0)
+    ratios = np.median([rate / bare_rate for rate, bare_rate in rates], axis=0)
     return {
         "engine": engine.name,
         "why": engine.why,
@@ -314,7 +314,7 @@ def speed(model: Any) -> dict[str, Any]:
 
 
 def _clocks() -> np.ndarray:
-    """Returns seconds: those that a core of this process has computed, and those of the clock.
+    """Returns [2] seconds: those that a core of this process has computed, and the clock's.
 
     Other programs slow down the second one only.
     """

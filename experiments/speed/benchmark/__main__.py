@@ -36,7 +36,7 @@ from typing import IO, Literal, NamedTuple
 
 import tyro
 
-from experiments.kit.rows import now, threads
+from experiments.kit.rows import now, shared_clock
 from experiments.speed.benchmark.rows import RAW, Candidate
 
 
@@ -264,11 +264,6 @@ def work(settings: Settings) -> None:
     for row in rows:
         words = (row[key] for key in ("task", "what", "engine", "precision", "batch"))
         print(*words, f"{speed(row):.3g} env steps/s", sep=", ", flush=True)
-
-
-def shared_clock() -> float:
-    """Returns the seconds that this process's threads have computed, divided by their number."""
-    return time.process_time() / threads()
 
 
 def task_of(run: Path) -> str:
