@@ -3,10 +3,16 @@
 They run on the CPU unless JAX_PLATFORMS names something else.
 """
 
+import gc
 import os
+import sys
 from importlib.metadata import version
 from pathlib import Path
 
+from places import WITHOUT_WARP
+
+# Tracing makes many objects and little garbage; the command lines of this package ask for the same.
+gc.set_threshold(100_000)
 # Before JAX is imported, which reads them once. The workers of pytest-xdist and the command lines
 # that tests run inherit them.
 os.environ.setdefault(
@@ -25,6 +31,11 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault(
     "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "programs")
 )
+# Where Playground has installed Warp, MJX imports it, which takes longer than all else that a process
+# imports. Those that tests start do without; the workers, which inherit the path, do not.
+path = [x for x in os.environ.get("PYTHONPATH", "").split(os.pathsep) if x]
+os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys([str(WITHOUT_WARP), *path]))
+sys.path[:] = [x for x in sys.path if x != str(WITHOUT_WARP)]
 
 import jax
 import pytest
@@ -38,6 +49,7 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if item.get_closest_marker("cpu") and jax.default_backend() != "cpu":
             item.add_marker(pytest.mark.skip(reason="it is for CPUs"))
+    gc.freeze()  # what was imported stays
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 

@@ -13,6 +13,7 @@ import pytest
 from c_programs import needs_compiler
 from command_lines import run_command
 from exports import run_export
+from places import PYTHONPATH
 from saved_runs import make_run
 
 import mjx_reinforce
@@ -95,7 +96,7 @@ def run_smaller(name, code, folder):
     for said, instead in SMALLER.get(name, {}).items():
         assert said in code, said
         code = code.replace(said, instead)
-    settings = os.environ | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"}
+    settings = os.environ | {"PYTHONPATH": PYTHONPATH, "MPLBACKEND": "agg"}
     command = [sys.executable, "-W", "ignore", "-c", code]
     subprocess.run(command, check=True, cwd=folder, env=settings)
 

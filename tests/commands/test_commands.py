@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from places import ROOT
+from places import PYTHONPATH, ROOT
 
 from mjx_reinforce import __main__ as script
 from mjx_reinforce import envs
@@ -215,7 +215,7 @@ def test_a_script_sees_modules_of_the_current_folder():
     done = subprocess.run(
         [sys.executable, "-P", "-m", "mjx_reinforce.envs", "my_arm:Arm"],
         cwd=ROOT / "experiments" / "examples",
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": PYTHONPATH},
         capture_output=True,
         text=True,
         check=False,

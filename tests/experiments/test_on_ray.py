@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 import pytest
-from places import ROOT
+from places import PYTHONPATH, ROOT
 
 from mjx_reinforce.reports.sources import read_experiment
 
@@ -14,7 +14,7 @@ DRIFT = "--env toys:Drift --num-episodes 4 --eval-episodes 2 --hidden-sizes 4 --
 @pytest.mark.slow
 def test_shares_are_trained_and_reported_on_together(tmp_path, monkeypatch):
     pytest.importorskip("ray")
-    monkeypatch.setenv("PYTHONPATH", f"{ROOT}:{ROOT / 'tests' / 'helpers'}")
+    monkeypatch.setenv("PYTHONPATH", PYTHONPATH)
     monkeypatch.setenv("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
     line = f"on_ray.py {tmp_path} --num-seeds 3 --share 2 --max-updates 2 {DRIFT}".split()
     line[0] = str(ROOT / "experiments" / "examples" / line[0])

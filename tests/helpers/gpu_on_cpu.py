@@ -100,7 +100,7 @@ def compiled(source, block=None):
         text = _PLAYER.format(**addresses) + text
     address = ctypes.cast(_ERFINV, ctypes.c_void_p).value
     text = f"#define erfinvf(x) ((float (*)(float)){address}ull)(x)\n{text}"
-    options = ("-std=c++17", "-O1", "-shared", "-fPIC", "-w", "-DREAL=float", "-x", "c++", "-")
+    options = ("-std=c++17", "-O0", "-shared", "-fPIC", "-w", "-DREAL=float", "-x", "c++", "-")
     with tempfile.TemporaryDirectory() as folder:
         library = f"{folder}/play.so"
         done = subprocess.run([COMPILER, *options, "-o", library], input=text, text=True)

@@ -193,19 +193,6 @@ def leg(task, steps):
     return task(xml_file=spec, frame_skip=2, max_episode_steps=steps, reward_threshold=None)
 
 
-def as_without_teams(teams, env):
-    """Returns the episodes of a task that machine code plays on the CPU; teams play the same."""
-    player = actor_and_act(env, (5,))
-    want = played(native.native_rollout, env, player, num_seeds=2)
-    made = teams()
-    got = played(native.native_rollout, env, player, num_seeds=2)
-    assert [kernel.launch.lanes for kernel in made] == [16, 16]
-    for name in ("observation", "reward"):
-        pair = (getattr(x, name)[:, :20] for x in (got, want))
-        np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
-    return want
-
-
 def as_in_c_mujoco(teams, env):
     """Returns the episodes of a task that C MuJoCo plays; teams play the same."""
     actor, act, distribution = player = actor_and_act(env, (5,))
@@ -222,7 +209,7 @@ def as_in_c_mujoco(teams, env):
 
 @pytest.mark.slow
 def test_teams_show_sensors(teams):
-    want = as_without_teams(teams, leg(Leg, 60))
+    want = as_in_c_mujoco(teams, leg(Leg, 60))
     assert (want.observation[..., 9] > 0).any()  # touch
 
 
@@ -230,9 +217,11 @@ def test_teams_show_sensors(teams):
 def test_teams_play_models_that_differ_from_episode_to_episode(teams):
     env = leg(RandomLeg, 40)
     actor, act, distribution = actor_and_act(env, (5,))
-    want = played(native.native_rollout, env, (actor, act, distribution), num_seeds=2)
+    policy = choice.ActingPolicy(act, actor, distribution)
+    in_c = choice.choose("mujoco", env, policy, 40)
+    want = played(in_c.rollout, env, (actor, act, distribution), num_seeds=2)
     made = teams()
-    engine = choice.choose("auto", env, choice.ActingPolicy(act, actor, distribution), 40)
+    engine = choice.choose("auto", env, policy, 40)
     assert (engine.name, engine.why.partition(", ")[2]) == ("native", "16 lanes an episode")
     got = played(engine.rollout, env, (actor, act, distribution), num_seeds=2)
     assert {kernel.launch.lanes for kernel in made} == {16}
@@ -256,7 +245,7 @@ def test_teams_play_mocap_bodies(teams, task):
 
 @pytest.mark.slow
 def test_teams_play_episodes_that_remember(teams):
-    want = as_without_teams(teams, leg(RememberingLeg, 40))
+    want = as_in_c_mujoco(teams, leg(RememberingLeg, 40))
     np.testing.assert_allclose(
         want.observation[:, 1:20, :, -3], want.action[:, :19, :, 0], atol=1e-6
     )
@@ -266,7 +255,7 @@ def test_teams_play_episodes_that_remember(teams):
 
 @pytest.mark.slow
 def test_teams_play_a_task_of_all_parts(teams):
-    want = as_without_teams(teams, Robot(steps=20))
+    want = as_in_c_mujoco(teams, Robot(steps=20))
     commands = want.observation[:, 0, :, -1]
     assert len(np.unique(commands[commands != 0])) > 3
 
