@@ -9,10 +9,6 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
-from places import WITHOUT_WARP
-
-# Tracing makes many objects and little garbage; the command lines of this package ask for the same.
-gc.set_threshold(100_000)
 # Before JAX is imported, which reads them once. The workers of pytest-xdist and the command lines
 # that tests run inherit them.
 os.environ.setdefault(
@@ -31,16 +27,19 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault(
     "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "programs")
 )
-# Where Playground has installed Warp, MJX imports it, which takes longer than all else that a process
-# imports. Those that tests start do without; the workers, which inherit the path, do not.
-path = [x for x in os.environ.get("PYTHONPATH", "").split(os.pathsep) if x]
-os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys([str(WITHOUT_WARP), *path]))
-sys.path[:] = [x for x in sys.path if x != str(WITHOUT_WARP)]
 
 import jax
 import pytest
 from command_lines import added_environments, run_command
+from places import WITHOUT_WARP
 
+# Tracing makes many objects and little garbage; the command lines of this package ask for the same.
+gc.set_threshold(100_000)
+# Where Playground has installed Warp, MJX imports it, which takes longer than all else that it
+# imports. Processes that tests start do without. The workers inherit the path, and do not.
+_PATHS = [x for x in os.environ.get("PYTHONPATH", "").split(os.pathsep) if x]
+os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys([str(WITHOUT_WARP), *_PATHS]))
+sys.path[:] = [x for x in sys.path if x != str(WITHOUT_WARP)]
 jax.config.update("jax_default_matmul_precision", "highest")
 
 
