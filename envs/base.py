@@ -121,6 +121,7 @@ class MujocoEnv(Env):
     #: What ``actuate`` adds to the controls at each env step of a period [P, nu], if it does that:
     #: files of ``export --env`` add it, too. ``parts.gait`` makes one, ``parts.cyclic`` reads it.
     gait: np.ndarray | None = None
+    _has_checked_centers = False
 
     def __init__(self, **arguments: object):
         """Compiles the model.
@@ -307,8 +308,10 @@ class MujocoEnv(Env):
         if type(self).randomize is not MujocoEnv.randomize:
             key, rng = jax.random.split(rng)
             episode = check_episode(name, self.randomize(key), self.mj_model)
-            if "body_ipos" in episode:
+            # Its draws compile as long as the task's own, which is asked dozens of times.
+            if "body_ipos" in episode and not self._has_checked_centers:
                 check_centers(name, self.randomize, self.mj_model.body_ipos, self.mj_model)
+                self._has_checked_centers = True
         start = self.initial(rng)
         if isinstance(start, str):
             start = self.key_frame(start)
