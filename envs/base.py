@@ -15,6 +15,7 @@ from mujoco import mjMAXVAL, mjx  # pyright: ignore[reportAttributeAccessIssue] 
 from mjx_reinforce.engine.base import (
     Box,
     PhysicsModel,
+    is_for_shapes,
     is_kept_whole,
     observation_size,
 )
@@ -571,7 +572,7 @@ class MujocoEnv(Env):
     def _stays_whole(self, episode: dict[str, jax.Array]) -> bool:
         """Returns whether the physics is to stay one operation, which device code computes."""
         fields = models.replaced(episode)
-        if not is_kept_whole() or not fields:
+        if not is_kept_whole() or not fields or is_for_shapes():
             return is_kept_whole()
         return fields.keys() <= {*self._random_fields} and self._is_in_device_code
 

@@ -225,6 +225,7 @@ class PhysicsModel(NamedTuple):
 
 #: JAX keeps what it traced with one value of this apart from what it traced with another.
 _WHOLE_CONTEXT = jax.make_user_context(False)
+_SHAPES_CONTEXT = jax.make_user_context(False)
 
 
 def keeping_whole() -> contextlib.AbstractContextManager[None]:
@@ -237,10 +238,15 @@ def is_kept_whole() -> bool:
     return _WHOLE_CONTEXT.value
 
 
+def is_for_shapes() -> bool:
+    """Returns whether nothing but shapes is asked for: what no backend knows may stay whole."""
+    return _SHAPES_CONTEXT.value
+
+
 def shapes(function: Callable[..., Any], *args: PyTree) -> Any:
     """Returns ``jax.eval_shape`` of what calls an environment, whose physics is not traced."""
     try:
-        with keeping_whole():
+        with keeping_whole(), _SHAPES_CONTEXT(True):
             return jax.eval_shape(function, *args)
     except Exception:  # it differentiates its physics, say; or it is wrong, which this says
         return jax.eval_shape(function, *args)

@@ -179,7 +179,7 @@ def test_episodes_are_those_of_models_compiled_with_what_was_drawn(float64, engi
     env, num_steps = Mechanism(), 15
     many = jax.random.split(jax.random.key(0), 200)
     # An episode begins with the second half of its key.
-    episodes, _ = jax.vmap(lambda key: env.draw(jax.random.split(key)[1]))(many)
+    episodes, _ = jax.jit(jax.vmap(lambda key: env.draw(jax.random.split(key)[1])))(many)
     _, first = np.unique(episodes["number"], return_index=True)
     keys = many[first]
     vec = make_vec(env, len(keys), engine=engine)
