@@ -268,14 +268,14 @@ def test_the_physics_kept_whole_gets_the_control():
 
 @pytest.mark.slow
 def test_a_policy_around_a_pose_trains_alike_in_every_engine():
+    """But in ``vmap``, which steps the environment as it is, as above."""
     returns = {}
-    for engine in ("vmap", "native", "mujoco"):
+    for engine in ("native", "mujoco"):
         learner = reinforce(Servo(), num_episodes=4, horizon=10, engine=engine)
         state = learner.init(jax.random.key(0))
         _, metrics = train_step(learner, state)
         returns[engine] = float(metrics["episode_return"])
-    assert returns["native"] == pytest.approx(returns["vmap"], rel=1e-3)
-    assert returns["mujoco"] == pytest.approx(returns["vmap"], rel=1e-3)
+    assert returns["native"] == pytest.approx(returns["mujoco"], rel=1e-3)
 
 
 class Mistaken(Servo):
@@ -289,11 +289,11 @@ class Mistaken(Servo):
 def test_another_number_of_controls_is_named():
     message = r"Mistaken.control must return \[2\], .* got the shape \[1\]; an action is \[1\]"
     env = Mistaken()
-    state: Any = env.reset(jax.random.key(0))
     for task in (env, env.in_c_mujoco()):
+        state = jax.eval_shape(task.reset, jax.random.key(0))
+        assert state.obs.shape == (env.observation_size,)
         with pytest.raises(BadEnvironmentError, match=message):
-            jax.eval_shape(task.step, task.reset(jax.random.key(0)), jnp.zeros(1))
-    assert state.obs.shape == (env.observation_size,)
+            jax.eval_shape(task.step, state, jnp.zeros(1))
 
 
 # -------------------------------------------------------------------------------------------------

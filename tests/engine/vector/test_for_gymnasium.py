@@ -235,7 +235,7 @@ for _ in range(8):
     env.step(np.full((2, 1), 3.0))
 assert np.any(env.render()[0] != picture)
 env.close()
-env = gym.make("HalfCheetah-v5", 2, render_mode="rgb_array")
+env = gym.make("HalfCheetah-v5", 2, engine="mujoco", render_mode="rgb_array")
 pictures = []
 for x in (0.0, 30 * 80 / 60):
     qpos = env.vec.env.mj_model.qpos0[None].copy()
