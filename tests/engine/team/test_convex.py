@@ -1,6 +1,7 @@
 """Contacts of the convex collider of the device code beside C MuJoCo's, in random poses."""
 
 import ctypes
+import functools
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -69,7 +70,7 @@ def _library(model: Any, folder: Path, real: str) -> Any:
     source = folder / "touch.cpp"
     source.write_text(text + _PROGRAM.read_text("utf-8"), "utf-8")
     library = folder / f"touch_{real}.so"
-    options = ["-O1", "-std=c++17", "-w", "-shared", "-fPIC", f"-DREAL={real}"]
+    options = ["-O0", "-std=c++17", "-w", "-shared", "-fPIC", f"-DREAL={real}"]
     command = [str(device_code.COMPILER), *options, str(source), "-o", str(library)]
     subprocess.run(command, check=True)
     return ctypes.CDLL(str(library))
@@ -112,19 +113,28 @@ def _poses(model: Any) -> Iterator[np.ndarray]:
         yield np.array([*(distance * direction), *(quat / np.linalg.norm(quat))])
 
 
-def _errors(kinds: tuple[str, str], margin: float, folder: Path, real: str = "double") -> _Errors:
-    """Returns how contacts differ from C's."""
+@functools.lru_cache(maxsize=2 * len(_PAIRS))
+def _expected(kinds: tuple[str, str], margin: float) -> tuple[Any, list[Any]]:
+    """Returns the model of two geoms, and pairs of poses of the second and C's contacts there."""
     first, second = (_GEOMS[x] for x in kinds)
     gap = margin / 2
     text = _TWO.format(first=first, second=second, margin=margin, gap=gap, meshes=_MESHES)
     model = _C.MjModel.from_xml_string(text)
     data = _C.MjData(model)
+    pairs = []
+    for qpos in _poses(model):
+        data.qpos[:] = qpos
+        pairs.append((qpos, _by_c(model, data)))
+    return model, pairs
+
+
+def _errors(kinds: tuple[str, str], margin: float, folder: Path, real: str = "double") -> _Errors:
+    """Returns how contacts differ from C's."""
+    model, pairs = _expected(kinds, margin)
     library = _library(model, folder, real)
     rows = []
     touches = 0
-    for qpos in _poses(model):
-        data.qpos[:] = qpos
-        theirs = _by_c(model, data)
+    for qpos, theirs in pairs:
         ours = _by_us(library, qpos)
         touches += len(theirs) > 0
         is_equal = len(ours) == len(theirs)
