@@ -55,7 +55,7 @@ def test_the_best_of_several_runs_is_packed(tmp_path):
     assert 40 < low <= facts["return"] <= high
     assert (facts["seed"], facts["episodes"], facts["horizon"]) == (1, 64, 60)
     earned = f"{facts['return']:.2f} ({low:.2f} to {high:.2f})"
-    assert said == [f"CartPole-v1: {earned}, of {runs / 'b' / 'c'}, seed 1, last"]
+    assert said == [f"CartPole-v1: {earned} on other starts, {runs / 'b' / 'c'}, seed 1, last"]
     assert facts["env_steps"] == 5002
     kept = {name: facts[name] for name in ("machine", "packages", "seconds", "seeds", "policy")}
     assert kept == {

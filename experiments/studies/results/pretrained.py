@@ -65,6 +65,8 @@ def pack(directory: Path, folder: Path, num_episodes: int) -> list[str]:
         found = [*_packaged(folder / task), *found]
         play = _simulations(found, num_episodes)
         means = [float(np.mean(play(x, _CHOICE))) for x in found]
+        for candidate, mean in zip(found, means, strict=True):
+            print(f"{task}: {mean:.2f}, {_name(candidate)}", flush=True)
         best = found[int(np.argmax(means))]
         returns = play(best, _MEASURE)
         provenance = _origin(best) | _earned(returns)
@@ -73,11 +75,8 @@ def pack(directory: Path, folder: Path, num_episodes: int) -> list[str]:
             save_policy(folder / task, actor, best.saved.settings)
         write_json(folder / task / PROVENANCE_FILE, provenance)
         low, high = provenance["interval"]
-        whose = "the package" if best.run.packaged else str(best.run.directory)
-        said.append(
-            f"{task}: {provenance['return']:.2f} ({low:.2f} to {high:.2f}), of {whose}, seed "
-            f"{best.player.seed}, {best.which}"
-        )
+        earned = f"{provenance['return']:.2f} ({low:.2f} to {high:.2f})"
+        said.append(f"{task}: {earned} on other starts, {_name(best)}")
         print(said[-1], flush=True)
     return said
 
@@ -122,6 +121,11 @@ def _packaged(folder: Path) -> Iterator[Candidate]:
         facts = read_json(path)
         run = Run(folder, facts["task"], facts["horizon"], (facts["seed"],), packaged=True)
         yield Candidate(run, facts["policy"], *load_seed(run, "best"))
+
+
+def _name(candidate: Candidate) -> str:
+    whose = "the package" if candidate.run.packaged else str(candidate.run.directory)
+    return f"{whose}, seed {candidate.player.seed}, {candidate.which}"
 
 
 def _earned(returns: np.ndarray) -> dict[str, Any]:
