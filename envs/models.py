@@ -77,6 +77,9 @@ def load_model(xml_file: ModelSource) -> Any:
     model.opt.enableflags &= ~_ONLY_REPORTS
     if is_off(model, "constraint"):  # C looks for no contacts then, MJX does
         model.opt.disableflags |= _C.mjtDisableBit.mjDSBL_CONTACT
+    if model.opt.solver == _C.mjtSolver.mjSOL_NEWTON and _C.mj_isSparse(model):
+        # MuJoCo 4.0.0 factorizes some sparse Hessians wrongly (findings/copies_of_five_masses.sh).
+        model.opt.jacobian = _C.mjtJacobian.mjJAC_DENSE
     for number in range(model.nnumeric):
         if model.numeric(number).name in _READ_BY_MJX:
             model.name_numericadr[number] = len(model.names) - 1  # a name of no letters
