@@ -160,9 +160,10 @@ def read_json(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise ValueError(f"cannot read {path} ({error.strerror})") from error
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
+        problem = error if path.stat().st_size else "it is empty"
+        raise ValueError(f"{path} is damaged: {problem}; put back a copy of it") from error
     if not isinstance(value, dict):
-        raise ValueError(f"{path} is damaged: it holds no JSON object")
+        raise ValueError(f"{path} is damaged: it holds no JSON object; put back a copy of it")
     return value
 
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 #: What a kill leaves of the first file of a run or a sweep, which then was not begun.
 _FIRST_PREFIXES = (".config.json.", ".sweep.json.")
 #: What the system says where no room is left, on the disk or of what this user may have of it.
-_FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 #: A disk with less room (bytes) is full: the files of a small run take about as much.
 _MIN_FREE_BYTES = 2**20
 
@@ -127,7 +127,7 @@ def own_directory(
         except OSError as error:
             remove_empty(new_folders)
             remedy = "make it a folder that you may write to"
-            if error.errno in _FULL_ERRORS:
+            if error.errno in FULL_ERRORS:
                 remedy = "make room there"
             if not resumed:
                 remedy += ", or choose another --output"

@@ -129,6 +129,11 @@ FULL = [
         1,
         "the files of this run ([Errno 28] No space left); make room, then try again",
     ),
+    (
+        IsADirectoryError(errno.EISDIR, "Is a directory", "out/summary.json"),
+        1,
+        "([Errno 21] Is a directory: 'out/summary.json'); mend that, then try again",
+    ),
     (OSError("no network"), 1, "the files of this run (no network); then try again"),
 ]
 
