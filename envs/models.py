@@ -62,8 +62,8 @@ def load_model(xml_file: ModelSource) -> Any:
         ``MjSpec`` or ``MjModel``, of which a copy is taken.
 
     Raises:
-      ValueError: there is no such file, MuJoCo cannot compile it, a number in it is not finite, its
-        timestep is not positive, or nothing in it can be moved; then the message has all that
+      ValueError: there is no such file, MuJoCo cannot compile it, its timestep is not positive, a
+        number in it is not finite, or nothing in it can be moved; then the message has all that
         ``to_mjx`` refuses, too.
     """
     if isinstance(xml_file, MjModel):
@@ -81,8 +81,8 @@ def load_model(xml_file: ModelSource) -> Any:
     if places := [*_nonfinite(model)]:
         causes = [place for place in places if not _DERIVED.fullmatch(place.partition(" ")[0])]
         raise ValueError(
-            f"{_name(xml_file)} has numbers that are not finite, in {listed(causes or places)}, as mjModel "
-            "names them; write finite ones"
+            f"{_name(xml_file)} has numbers that are not finite, in {listed(causes or places)}, as "
+            "mjModel names them; write finite ones"
         )
     # Said together with all that MJX would refuse, so that the file is mended once.
     if not model.nu:
@@ -104,17 +104,17 @@ def _nonfinite(model: Any) -> Iterator[str]:
     """
     for prefix, owner in (("", model), ("opt.", model.opt), ("stat.", model.stat)):
         for field in dir(owner):
-            values = np.asarray(getattr(owner, field, None))
+            values = np.atleast_1d(getattr(owner, field))
             if values.dtype.kind != "f" or _UNREAD.fullmatch(field):
                 continue
             is_bad = np.isnan(values) if _MAY_BE_INFINITE.fullmatch(field) else ~np.isfinite(values)
             if is_bad.any():
-                row = int(np.argwhere(np.atleast_1d(is_bad))[0, 0])
-                yield f"{prefix}{field}{_owner(model, field, np.atleast_1d(values), row)}"
+                row = int(np.argwhere(is_bad)[0, 0])
+                yield f"{prefix}{field}{_owner(model, field, values, row)}"
 
 
 def _owner(model: Any, field: str, values: np.ndarray, row: int) -> str:
-    """Returns whose row of a field it is, as a message goes on, or nothing where rows are others."""
+    """Returns whose row of a field it is, for a message, or nothing where rows are no elements."""
     kind = field.partition("_")[0]
     count = getattr(model, f"n{kind}", None)
     if kind in ("dof", "qpos", "qpos0"):

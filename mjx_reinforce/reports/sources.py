@@ -302,8 +302,8 @@ def _read_run(directory: Path, config: dict[str, Any]) -> Source:
     num_seeds = len(columns["seed"])
     if num_seeds != config.get("num_seeds", num_seeds):
         raise ValueError(
-            f"{directory}/metrics.csv has {num_seeds} seeds, config.json {config['num_seeds']}: they "
-            "are of different runs; put back the one that was there"
+            f"{directory}/metrics.csv has {num_seeds} seeds, config.json {config['num_seeds']}: "
+            "they are of different runs; put back the one that was there"
         )
     # The summary is written at the end; until then the run is read as far as it came.
     path = directory / "summary.json"

@@ -3,6 +3,7 @@
 import dataclasses
 import gc
 import os
+import shlex
 import sys
 import traceback
 from collections.abc import Sequence
@@ -14,9 +15,9 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.streams import accept_everything, say_error, silence_alarms
-from mjx_reinforce.files import MovedError
+from mjx_reinforce.files import FULL_ERRORS, MovedError
 from mjx_reinforce.runs.design import Design, SweepSettings, check_swept, read_design, read_over
-from mjx_reinforce.runs.perform import FULL_ERRORS, perform, report_on
+from mjx_reinforce.runs.perform import perform, report_on
 from mjx_reinforce.settings.config import (
     CODE,
     Config,
@@ -271,7 +272,8 @@ def _refuse_full(error: RuntimeError | MemoryError | OSError, design: Design) ->
             refuse(str(MovedError(design.directory)), status=1)
         remedy = "try again"
         if any((design.directory / name).exists() for name in resume.FIRST_FILES):
-            remedy = f"go on with --resume {design.directory}{code_flags(vars(design.base))}"
+            quoted = shlex.quote(str(design.directory))
+            remedy = f"go on with --resume {quoted}{code_flags(vars(design.base))}"
         # Errors of W&B have no number, and there is nothing here to mend.
         if error.errno in FULL_ERRORS:
             advice = "make room, then"

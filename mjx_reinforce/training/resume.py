@@ -417,9 +417,7 @@ def newest_checkpoint(config: Config, say: Callable[[str], None]) -> Checkpoint 
                 )
         # Rows are cut off down to a checkpoint's length; rows that are lost cannot come back.
         if not _has_rows(metrics, checkpoint, config.num_seeds):
-            say(
-                f"metrics.csv lacks rows of checkpoint {checkpoint.number}; trying the one before"
-            )
+            say(f"metrics.csv lacks rows of checkpoint {checkpoint.number}; trying the one before")
         elif _serves(checkpoint, config):
             return checkpoint
         else:

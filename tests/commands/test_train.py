@@ -161,6 +161,16 @@ def test_what_is_full_is_said_in_one_line(failing, tmp_path, capsys, error, stat
     assert not (tmp_path / "out").exists()
 
 
+def test_the_flag_that_goes_on_may_be_copied_to_a_shell(run, tmp_path, monkeypatch, capsys):
+    def conduct(*_):
+        (tmp_path / "my run" / "config.json").write_text("{}")
+        raise OSError(errno.ENOSPC, "No space left")
+
+    monkeypatch.setattr("mjx_reinforce.runs.conduct.conduct", conduct)
+    assert run(*ARGUMENTS, "--output", "my run") == 1
+    assert "then go on with --resume 'my run'" in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_mistake_of_ours_in_training_is_no_bad_input(failing):
     with pytest.raises(ValueError, match="a bug"):
         failing(ValueError("a bug"))

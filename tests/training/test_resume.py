@@ -361,6 +361,9 @@ REFUSED = [
     ("", {"one_start": True}, "has other settings (one_start): it is damaged, or of another"),
     ("", {"eval_every": None}, "eval_every is None: it is damaged, or of another version of the"),
     ("", {"engine": "kernel"}, "engine is 'kernel': it is damaged"),
+    ("", {"learning_rate": -1.0}, "parts/config.json: --learning-rate must be positive"),
+    ("", {"env": "Nothing-v9"}, "parts/config.json: unknown environment 'Nothing-v9'"),
+    ("", {"resumed": 3}, "parts/config.json is damaged: resumed must be"),
 ]
 
 
