@@ -25,7 +25,8 @@ from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
 from mjx_reinforce.engine.scalar import prune, whole
 from mjx_reinforce.engine.team import last_pass, supported, tables
-from mjx_reinforce.envs import derived, in_batch, models, refusals
+from mjx_reinforce.envs import derived, models, refusals
+from mjx_reinforce.envs.c_mujoco import in_batch
 from mjx_reinforce.envs.outcomes import (
     check_centers,
     check_control,

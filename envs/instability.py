@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from mjx_reinforce.engine.base import MjModel
-from mjx_reinforce.envs.in_mujoco import was_reset
+from mjx_reinforce.envs.c_mujoco.in_mujoco import was_reset
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco

@@ -12,7 +12,7 @@ import numpy as np
 from mjx_reinforce.engine.base import term_names
 from mjx_reinforce.engine.episode import begin, hold, step
 from mjx_reinforce.engine.play.choice import environment_of
-from mjx_reinforce.envs.in_mujoco import InMujoco
+from mjx_reinforce.envs.c_mujoco.in_mujoco import InMujoco
 from mjx_reinforce.export.policy_files import Player
 from mjx_reinforce.learning.policy import act
 

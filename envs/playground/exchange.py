@@ -19,7 +19,7 @@ from mujoco import mjx  # pyright: ignore[reportAttributeAccessIssue] (a C exten
 
 from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.physics import mjx_internals
-from mjx_reinforce.envs.in_batch import spec_of
+from mjx_reinforce.envs.c_mujoco.fields import spec_of
 from mjx_reinforce.envs.starts import at_rest, start_shapes
 
 #: MuJoCo's own names; it is a C extension without stubs.

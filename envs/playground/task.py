@@ -20,7 +20,7 @@ from mjx_reinforce.engine.checks import BadEnvironmentError, explain, require
 from mjx_reinforce.engine.play.counter import key_of_words
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import MujocoEnv
-from mjx_reinforce.envs.in_batch import FieldRecorder
+from mjx_reinforce.envs.c_mujoco.fields import FieldRecorder
 from mjx_reinforce.envs.playground.exchange import (
     PhysicsReached,
     Start,

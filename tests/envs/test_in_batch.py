@@ -12,8 +12,8 @@ import pytest
 
 from mjx_reinforce import envs, make_vec, reinforce, train_step
 from mjx_reinforce.engine.play import choice
-from mjx_reinforce.envs import in_batch
 from mjx_reinforce.envs.base import MujocoEnv
+from mjx_reinforce.envs.c_mujoco import in_batch
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup.ready import build_ready
 

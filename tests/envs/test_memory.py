@@ -12,7 +12,7 @@ from mujoco import MjSpec  # type: ignore
 from mjx_reinforce import make_vec
 from mjx_reinforce.engine import rollout
 from mjx_reinforce.envs.base import MujocoEnv
-from mjx_reinforce.envs.in_mujoco import InMujoco
+from mjx_reinforce.envs.c_mujoco.in_mujoco import InMujoco
 
 MODEL = """
 <mujoco>

@@ -13,7 +13,7 @@ from robot import ROBOT, Robot
 
 from mjx_reinforce.engine import rollout
 from mjx_reinforce.envs import models, parts
-from mjx_reinforce.envs.in_mujoco import InMujoco
+from mjx_reinforce.envs.c_mujoco.in_mujoco import InMujoco
 from mjx_reinforce.envs.state import Before
 
 KEYS = jax.random.split(jax.random.key(0), 2000)

@@ -14,7 +14,7 @@ from places import PYTHONPATH
 
 from mjx_reinforce import envs, make_vec
 from mjx_reinforce.engine import contract
-from mjx_reinforce.envs.in_mujoco import InMujoco
+from mjx_reinforce.envs.c_mujoco.in_mujoco import InMujoco
 from mjx_reinforce.export.control import affine_control
 from mjx_reinforce.settings.defaults import SUITE
 

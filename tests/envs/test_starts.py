@@ -12,7 +12,7 @@ from mjx_reinforce import Box, make_vec, reinforce, train_step
 from mjx_reinforce.engine import base
 from mjx_reinforce.engine.checks import BadEnvironmentError
 from mjx_reinforce.envs.base import MujocoEnv
-from mjx_reinforce.envs.in_mujoco import InMujoco
+from mjx_reinforce.envs.c_mujoco.in_mujoco import InMujoco
 
 #: MuJoCo's own names; it is a C extension without stubs.
 mujoco: Any = mujoco_bindings

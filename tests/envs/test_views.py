@@ -13,7 +13,7 @@ from mjx_reinforce import make_vec, mlp_policy, normal, playing, reinforce, roll
 from mjx_reinforce.engine.episode import episode_keys
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import MujocoEnv
-from mjx_reinforce.envs.in_mujoco import InMujoco
+from mjx_reinforce.envs.c_mujoco.in_mujoco import InMujoco
 from mjx_reinforce.envs.refusals import UnsupportedError
 from mjx_reinforce.export.policy_files import Player
 from mjx_reinforce.learning import normalize

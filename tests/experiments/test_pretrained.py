@@ -44,7 +44,7 @@ def test_the_best_of_several_runs_is_packed(tmp_path):
     runs = tmp_path / "runs"
     for name, returns in (("a", [90.0, 1.0, 2.0]), ("b/c", [1.0, 9.0, 2.0]), ("d", [1.0, 2.0, 3])):
         change(finished(runs / name) / "summary.json", final_returns=returns)
-    change(finished(runs / "unfinished") / "summary.json", status="interrupted")
+    change(finished(runs / "unfinished") / "summary.json", status="running")
     said = pretrained.pack(runs, tmp_path / "out", 64)
     assert len(said) == 1
     facts = read_json(tmp_path / "out" / "CartPole-v1" / "provenance.json")
@@ -54,7 +54,8 @@ def test_the_best_of_several_runs_is_packed(tmp_path):
     low, high = facts["interval"]
     assert 40 < low <= facts["return"] <= high
     assert (facts["seed"], facts["episodes"], facts["horizon"]) == (1, 64, 60)
-    assert said == [f"CartPole-v1: {facts['return']:.1f} ({low:.1f} to {high:.1f})"]
+    earned = f"{facts['return']:.2f} ({low:.2f} to {high:.2f})"
+    assert said == [f"CartPole-v1: {earned} on other starts, {runs / 'b' / 'c'}, seed 1, last"]
     assert facts["env_steps"] == 5002
     kept = {name: facts[name] for name in ("machine", "packages", "seconds", "seeds", "policy")}
     assert kept == {
@@ -64,6 +65,29 @@ def test_the_best_of_several_runs_is_packed(tmp_path):
         "seeds": 3,
         "policy": "last",
     }
+
+
+def test_the_packages_policy_stays_where_no_run_is_better(tmp_path):
+    """Interrupted runs take part, by their last policies."""
+    place = tmp_path / "out" / "CartPole-v1"
+    # By name of the run: its best seed, that of the package afterwards, and its seconds.
+    for name, best, seed, seconds in (
+        ("poor", 0, 0, 12.3),
+        ("good", 1, 1, 12.3),
+        ("poor again", 0, 1, 99.0),
+        ("equal", 1, 1, 99.0),
+    ):
+        returns = [5.0 + (i == best) for i in range(3)]
+        run = finished(tmp_path / name / "run")
+        change(run / "summary.json", final_returns=returns, status="interrupted")
+        pretrained.pack(tmp_path / name, tmp_path / "out", 32)
+        facts = read_json(place / "provenance.json")
+        assert (facts["seed"], facts["seconds"]) == (seed, seconds)
+        assert (facts["return"] > 40) == (seed == 1)  # measured, also of what stays
+        _, packed = load_policy(place, 0)
+        _, expected = load_policy(run / "policy", seed)
+        jax.tree.map(np.testing.assert_array_equal, packed, expected)
+        change(place / "provenance.json", seconds=99.0, **{"return": -1.0})
 
 
 def test_the_command_gives_the_settings_again():
@@ -77,5 +101,5 @@ def test_the_command_gives_the_settings_again():
 
 
 def test_no_run_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="has no run of a task of this package that has ended"):
+    with pytest.raises(ValueError, match="has no run of a task of this package with policies"):
         pretrained.pack(tmp_path, tmp_path / "out", 8)

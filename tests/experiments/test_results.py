@@ -4,9 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from experiments.studies.results import __main__ as results
-from experiments.studies.results import kept, listing, runs, tables
+from experiments.studies.results import films, kept, listing, runs, tables
 from experiments.studies.results.tasks import TASKS, settings_of
 from mjx_reinforce.files import read_json, write_json
 from mjx_reinforce.runs import command_line
@@ -158,3 +159,17 @@ def test_the_tables_of_both_pages(folder):
     assert (docs / "results" / "seconds.png").exists()
     for text in (page, readme):
         assert "was here" not in text
+
+
+def test_a_film_that_is_too_large_has_fewer_colors_and_then_no_end(tmp_path):
+    path, noise = tmp_path / "noise.gif", np.random.default_rng(0)
+    frames = noise.integers(0, 256, (8, 32, 32, 3), np.uint8)
+    lengths = []
+    for most_bytes in (9_000, 4_000, 3_000):
+        films.write_small_gif(path, frames, 10.0, most_bytes)
+        assert path.stat().st_size <= most_bytes
+        with Image.open(path) as film:
+            lengths.append(film.n_frames)
+    assert lengths == [8, 6, 4]
+    with pytest.raises(ValueError, match=r"half of .*noise\.gif would have"):
+        films.write_small_gif(path, frames, 10.0, 1_000)

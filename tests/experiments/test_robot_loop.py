@@ -15,7 +15,7 @@ from places import ROOT
 from saved_runs import change_env, make_run
 
 from mjx_reinforce import envs, load, new
-from mjx_reinforce.envs.in_mujoco import InMujoco
+from mjx_reinforce.envs.c_mujoco.in_mujoco import InMujoco
 
 EXAMPLES = ROOT / "experiments" / "examples"
 SPACE = {"action_low": [-1.0] * 12, "action_high": [1.0] * 12}

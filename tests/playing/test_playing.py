@@ -12,7 +12,7 @@ from saved_runs import make_run
 from toys import Survive, ToyState
 
 from mjx_reinforce import envs, load, playing, pretrained
-from mjx_reinforce.envs.in_mujoco import InMujoco
+from mjx_reinforce.envs.c_mujoco.in_mujoco import InMujoco
 from mjx_reinforce.watch import untrained
 
 

@@ -9,7 +9,7 @@ and what was stopped (Ctrl-C, or ``timeout -s INT 570 python ...``) goes on.
     python -m experiments.studies.results seconds DIR      # data, of runs that were given a time
     python -m experiments.studies.results runs DIR         # prints a table of all runs there
     python -m experiments.studies.results page             # the tables and the picture, from data
-    python -m experiments.studies.results pretrained DIR   # the package's policies, of all runs
+    python -m experiments.studies.results pretrained DIR   # better ones for the package
     python -m experiments.studies.results films            # docs/films, of the package's policies
 
 The tasks, their budgets, their seeds and the published figures are the table in tasks.py.

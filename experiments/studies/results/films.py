@@ -1,5 +1,7 @@
 """Films of the package's own policies, for README.md and docs: several beside each other."""
 
+import itertools
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,8 +17,8 @@ from mjx_reinforce.watch import scene
 #: The tasks side by side, and the size of a file at most (bytes).
 _TASKS = ("Hopper-v5", "HalfCheetah-v5", "Ant-v5", "Humanoid-v5", "HumanoidStandup-v5")
 LARGEST = 300_000
-#: How many colors a film has, if it may not have more.
-_FEWER_COLORS = (128, 64, 32, 16, 8)
+#: How many colors a film has, if it may not have more, and then the share of it that is kept.
+_FEWER_COLORS, _SHORTER = (128, 64, 32, 16, 8), (1.0, 0.75, 0.5)
 
 
 def write(folder: Path, arm: Path | None) -> None:
@@ -36,11 +38,13 @@ def save(path: Path, film: Film) -> None:
     """Writes a film of ``LARGEST`` bytes at most, and says how large it is."""
     frames = [film.draw(frame) for frame in range(film.length)]
     write_small_gif(path, frames, film.rate, LARGEST)
-    print(f"{path}: {len(frames)} frames, {path.stat().st_size / 1000:.0f} kB", flush=True)
+    print(f"{path}: {path.stat().st_size / 1000:.0f} kB", flush=True)
 
 
 def write_small_gif(path: Path, frames: Sequence[np.ndarray], rate: float, most_bytes: int) -> None:
     """Writes a .gif of so many bytes at most, with as many colors as that allows.
+
+    If it is larger with the fewest colors, its end is left out.
 
     Args:
       path: .gif.
@@ -49,16 +53,17 @@ def write_small_gif(path: Path, frames: Sequence[np.ndarray], rate: float, most_
       most_bytes: of the file.
 
     Raises:
-      ValueError: the film is larger with the fewest colors.
+      ValueError: half of the film is larger with the fewest colors.
     """
-    film, samples = b"", frames[:: -(-len(frames) // SAMPLES)]
-    for colors in _FEWER_COLORS:
-        film = gif(frames, rate, samples, colors)
+    film = b""
+    for share, colors in itertools.product(_SHORTER, _FEWER_COLORS):
+        shown = frames[: math.ceil(share * len(frames))]
+        film = gif(shown, rate, shown[:: -(-len(shown) // SAMPLES)], colors)
         if len(film) <= most_bytes:
             write_bytes(path, film)
             return
     raise ValueError(
-        f"{path} would have {len(film)} bytes, {most_bytes} are allowed: make it shorter or smaller"
+        f"half of {path} would have {len(film)} bytes, {most_bytes} are allowed: make it smaller"
     )
 
 

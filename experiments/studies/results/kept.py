@@ -166,6 +166,11 @@ def task_name(config: dict[str, Any]) -> str:
     return config["env"] if race == 1 else f"{config['env']}, best of races of {race}"
 
 
+def env_id(task: str) -> str:
+    """Returns the environment id of what ``task_name`` returned."""
+    return task.partition(",")[0]
+
+
 def _device(config: dict[str, Any]) -> str:
     if config["device"] != "cpu":
         return str(config["device"])

@@ -10,7 +10,7 @@ import numpy as np
 from experiments.kit.episodes import own_simulation
 from experiments.studies.results.films import save
 from experiments.studies.results.kept import POLICIES, write_played
-from experiments.studies.results.runs import ended
+from experiments.studies.results.runs import has_policies
 from experiments.studies.results.tasks import ROOT, Task
 from mjx_reinforce import Player, envs, load
 from mjx_reinforce.console.jax_setup import configure_jax
@@ -24,7 +24,7 @@ _SECONDS, _RATE, _SIZE = 6.0, 12, (320, 240)
 
 
 def play(tasks: Iterable[Task], directory: Path, films: Path, num_episodes: int) -> None:
-    """Plays the policies of those tasks whose runs have ended, and films them in Gymnasium.
+    """Plays the policies of those tasks whose runs have some, and films the best in Gymnasium.
 
     Args:
       tasks: of the results.
@@ -37,7 +37,7 @@ def play(tasks: Iterable[Task], directory: Path, films: Path, num_episodes: int)
     films.mkdir(parents=True, exist_ok=True)
     for task in tasks:
         path = directory / "play" / f"{task.name}.csv"
-        if path.exists() or not ended(directory / task.name):
+        if path.exists() or not has_policies(directory / task.name):
             print(f"{task.name} is {'played' if path.exists() else 'not trained'}", flush=True)
             continue
         print(f"== {task.name}", flush=True)

@@ -1,4 +1,8 @@
-"""The trained policies that come with the package: the best of each task, from runs."""
+"""The trained policies that come with the package: the best of each task, from runs.
+
+The policy of the package is one of those that are compared, and stays where no run has a better
+one. What it earned is measured again.
+"""
 
 import dataclasses
 import json
@@ -12,7 +16,7 @@ import numpy as np
 from scipy import stats
 
 from experiments.kit.episodes import own_simulation
-from experiments.studies.results.runs import ended
+from experiments.studies.results.runs import has_policies
 from mjx_reinforce import envs
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.export.policy_files import Player, SavedPolicy, load_seed, save_policy
@@ -28,7 +32,7 @@ _NOT_SAID = {"output", "minutes", "env", "engine", "log"}
 
 
 class Candidate(NamedTuple):
-    """The best seed of a run, by the run's own evaluation."""
+    """The best seed of a run, by the run's own evaluation, or the package's policy until now."""
 
     run: Run
     which: str
@@ -48,25 +52,31 @@ def pack(directory: Path, folder: Path, num_episodes: int) -> list[str]:
       A line for each task: its return.
 
     Raises:
-      ValueError: there is no run that has ended.
+      ValueError: there is no run with policies.
     """
     configure_jax()
     runs = [read_run(path) for path in _runs(directory)]
     if not runs:
-        raise ValueError(f"{directory} has no run of a task of this package that has ended")
+        raise ValueError(f"{directory} has no run of a task of this package with policies")
     said = []
     for task in sorted({run.env for run in runs}):
         found = [x for run in runs if run.env == task for x in _candidates(run)]
+        # The first of equal ones is chosen.
+        found = [*_packaged(folder / task), *found]
         play = _simulations(found, num_episodes)
         means = [float(np.mean(play(x, _CHOICE))) for x in found]
+        for candidate, mean in zip(found, means, strict=True):
+            print(f"{task}: {mean:.2f}, {_name(candidate)}", flush=True)
         best = found[int(np.argmax(means))]
         returns = play(best, _MEASURE)
-        provenance = _provenance(best, returns)
-        actor = jax.tree.map(lambda x: np.asarray(x)[None], best.player.actor)
-        save_policy(folder / task, actor, best.saved.settings)
+        provenance = _origin(best) | _earned(returns)
+        if not best.run.packaged:
+            actor = jax.tree.map(lambda x: np.asarray(x)[None], best.player.actor)
+            save_policy(folder / task, actor, best.saved.settings)
         write_json(folder / task / PROVENANCE_FILE, provenance)
         low, high = provenance["interval"]
-        said.append(f"{task}: {provenance['return']:.1f} ({low:.1f} to {high:.1f})")
+        earned = f"{provenance['return']:.2f} ({low:.2f} to {high:.2f})"
+        said.append(f"{task}: {earned} on other starts, {_name(best)}")
         print(said[-1], flush=True)
     return said
 
@@ -93,33 +103,49 @@ def _simulations(
 def _runs(directory: Path) -> Iterator[Path]:
     for path in sorted(directory.rglob("config.json")):
         run = path.parent
-        if (
-            envs.is_ours(read_json(path).get("env", ""))
-            and ended(run)
-            and (run / "policy").exists()
-        ):
+        if envs.is_ours(read_json(path).get("env", "")) and has_policies(run):
             yield run
 
 
 def _candidates(run: Run) -> Iterator[Candidate]:
-    for which in ("last", "best"):
-        if which == "last" or (run.directory / "policy" / "best").is_dir():
-            yield Candidate(run, which, *load_seed(run, "best", which))
+    yield Candidate(run, "last", *load_seed(run, "best"))
+    # A run that was interrupted has not tested its other policies.
+    if "best_test_returns" in read_json(run.directory / "summary.json"):
+        yield Candidate(run, "best", *load_seed(run, "best", "best"))
 
 
-def _provenance(best: Candidate, returns: np.ndarray) -> dict[str, Any]:
-    """Returns where a policy comes from and what it earned, see ``pretrained.pretrained``."""
-    written, summary = (read_json(best.run.directory / f"{x}.json") for x in ("config", "summary"))
+def _packaged(folder: Path) -> Iterator[Candidate]:
+    """Returns the package's policy of a task, if there is one."""
+    path = folder / PROVENANCE_FILE
+    if path.exists():
+        facts = read_json(path)
+        run = Run(folder, facts["task"], facts["horizon"], (facts["seed"],), packaged=True)
+        yield Candidate(run, facts["policy"], *load_seed(run, "best"))
+
+
+def _name(candidate: Candidate) -> str:
+    whose = "the package" if candidate.run.packaged else str(candidate.run.directory)
+    return f"{whose}, seed {candidate.player.seed}, {candidate.which}"
+
+
+def _earned(returns: np.ndarray) -> dict[str, Any]:
+    """Returns what episodes say of a policy, see ``run_files.pretrained``."""
     mean, spread = float(np.mean(returns)), float(stats.sem(returns))
     half = spread * float(stats.t.ppf(0.975, len(returns) - 1))
+    interval = [round(mean - half, 2), round(mean + half, 2)]
+    return {"return": round(mean, 2), "interval": interval, "episodes": len(returns)}
+
+
+def _origin(best: Candidate) -> dict[str, Any]:
+    """Returns where a policy comes from, see ``run_files.pretrained``."""
+    if best.run.packaged:
+        return read_json(best.run.directory / PROVENANCE_FILE)
+    written, summary = (read_json(best.run.directory / f"{x}.json") for x in ("config", "summary"))
     device = written["device"]
     if device == "cpu":
         device = written["cpu"].split(",")[0]
     return {
         "task": best.run.env,
-        "return": round(mean, 2),
-        "interval": [round(mean - half, 2), round(mean + half, 2)],
-        "episodes": len(returns),
         "command": command(written),
         "git_commit": written["git_commit"],
         "machine": f"{device}, {written['cpu_count']} CPU cores",

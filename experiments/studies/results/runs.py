@@ -36,5 +36,14 @@ def command(task: Task, directory: Path) -> list[str]:
 
 def ended(directory: Path) -> bool:
     """Returns whether a run was trained to its end: its budget, or that of finite numbers."""
+    return _status(directory) in ("finished", "stopped")
+
+
+def has_policies(directory: Path) -> bool:
+    """Returns whether a run ended, or was interrupted and left its policies."""
+    return _status(directory) not in (None, "running") and (directory / "policy").is_dir()
+
+
+def _status(directory: Path) -> str | None:
     path = directory / "summary.json"
-    return path.exists() and read_json(path)["status"] in ("finished", "stopped")
+    return read_json(path)["status"] if path.exists() else None

@@ -231,7 +231,10 @@ def play(played: Mapping[str, Columns], docs: Path) -> str:
 
 
 def readme(groups: Sequence[Group], docs: Path) -> str:
-    """Returns the table of README.md; of several CPUs the one with the most runs counts."""
+    """Returns the table of README.md.
+
+    Of several CPUs, that with the most runs counts; of several GPUs, the newest model.
+    """
     rows = []
     for task in _README:
         mine = [group for group in groups if group.task == task]
@@ -239,8 +242,8 @@ def readme(groups: Sequence[Group], docs: Path) -> str:
         on_cpu = sorted((x for x in mine if not x.is_gpu), key=lambda x: len(x.final))
         cells = [_round(np.median(on_cpu[-1].minute)) if on_cpu else "", "", "", "", ""]
         if on_gpu:
-            cells[1] = _round(on_gpu[0].minute.mean())
-            cells[2] = f"{_round(on_gpu[0].final.mean())} in {seconds(on_gpu[0].seconds)}"
+            cells[1] = _round(on_gpu[-1].minute.mean())
+            cells[2] = f"{_round(on_gpu[-1].final.mean())} in {seconds(on_gpu[-1].seconds)}"
         for place, method in enumerate(("PPO", "off-policy"), start=3):
             if figure := kept.published(docs / "published.csv", task, method):
                 cells[place] = _round(figure.mean)

@@ -109,4 +109,4 @@ def checks() -> list[str]:
             entry = "[0]" if count > 1 else ""
             conditions.append(f"{numbered}.{field}{entry} == {offset}")
             offset += count
-    return [f'static_assert({x}, "a row of tables.py");' for x in conditions]
+    return [f'static_assert({x}, "a row of tables");' for x in conditions]

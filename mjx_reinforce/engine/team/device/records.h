@@ -1,5 +1,5 @@
-// The rows of a model's tables that have several numbers. tables.py writes the rows, and has the
-// compiler check that both have the same fields in the same order.
+// The rows of a model's tables that have several numbers. `engine.team.tables` writes the rows, and
+// has the compiler check that both have the same fields in the same order.
 #pragma once
 
 // A part of a pair of geoms that makes one contact at most: an end of a capsule, a corner of a box.

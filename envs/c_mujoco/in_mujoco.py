@@ -11,7 +11,7 @@ import numpy as np
 from mjx_reinforce.engine.base import Environment
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import Before, MujocoEnv
-from mjx_reinforce.envs.in_batch import FieldRecorder, read_all, spec_of
+from mjx_reinforce.envs.c_mujoco.fields import FieldRecorder, read_all, spec_of
 from mjx_reinforce.envs.outcomes import check_control, check_push
 from mjx_reinforce.envs.state import (
     NOTHING,

@@ -1,0 +1,1 @@
+"""Tasks that C MuJoCo steps: many episodes at once, or one."""
