@@ -64,8 +64,8 @@ def read_record(directory: Path) -> dict[str, Any]:
             if not isinstance(error.__cause__, FileNotFoundError):
                 raise
     raise ValueError(
-        f"cannot resume {directory}: there is no {' or '.join(FIRST_FILES)}, so nothing was begun "
-        "there; start it anew with --output"
+        f"cannot resume {directory}: there is no {' or '.join(FIRST_FILES)}; put back a copy, or, "
+        "if nothing was begun there, start it anew with --output"
     )
 
 
