@@ -3,8 +3,9 @@
 import copy
 import hashlib
 import importlib.resources
+import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -15,7 +16,7 @@ from mujoco import MjModel, MjSpec, mjx  # pyright: ignore[reportAttributeAccess
 
 from mjx_reinforce.engine.checks import BadEnvironmentError, explain
 from mjx_reinforce.engine.physics import contacts
-from mjx_reinforce.envs.refusals import check_supported, is_off, may_touch
+from mjx_reinforce.envs.refusals import check_supported, is_off, listed, may_touch
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco
@@ -41,6 +42,12 @@ RANDOM = (
 _ONLY_REPORTS = int(_C.mjtEnableBit.mjENBL_ENERGY | _C.mjtEnableBit.mjENBL_FWDINV)
 #: Elements of <custom> that MJX reads, by which it drops contacts. To C they are the user's own.
 _READ_BY_MJX = ("max_contact_points", "max_geom_pairs")
+#: Fields of a model that no step reads: pictures, and what is the user's own.
+_UNREAD = re.compile(r"(cam|light|mat|skin)_.*|.*_(rgba|user)|numeric_data|tuple_objprm")
+#: Those in which an infinite number means that there is no limit.
+_MAY_BE_INFINITE = re.compile(r".*(range|cutoff|lengthspring|yield)")
+#: Those that MuJoCo computes of others, which a message names in place of these.
+_DERIVED = re.compile(r"stat\..*|body_(margin|subtreemass)|.*(_aabb|[^s]0)")
 #: What MuJoCo calls a model without a name.
 _NAMELESS = "MuJoCo Model"
 #: The name of a file, an ``MjSpec`` or an ``MjModel``, which MuJoCo does not declare.
@@ -55,8 +62,9 @@ def load_model(xml_file: ModelSource) -> Any:
         ``MjSpec`` or ``MjModel``, of which a copy is taken.
 
     Raises:
-      ValueError: there is no such file, MuJoCo cannot compile it, its timestep is not positive, or
-        nothing in it can be moved; then the message has all that ``to_mjx`` refuses, too.
+      ValueError: there is no such file, MuJoCo cannot compile it, its timestep is not positive, a
+        number in it is not finite, or nothing in it can be moved; then the message has all that
+        ``to_mjx`` refuses, too.
     """
     if isinstance(xml_file, MjModel):
         model = copy.copy(xml_file)
@@ -69,6 +77,12 @@ def load_model(xml_file: ModelSource) -> Any:
         raise ValueError(
             f"{_name(xml_file)} has the timestep {model.opt.timestep}; write a finite number of "
             "seconds above 0"
+        )
+    if places := [*_nonfinite(model)]:
+        causes = [place for place in places if not _DERIVED.fullmatch(place.partition(" ")[0])]
+        raise ValueError(
+            f"{_name(xml_file)} has numbers that are not finite, in {listed(causes or places)}, as "
+            "mjModel names them; write finite ones"
         )
     # Said together with all that MJX would refuse, so that the file is mended once.
     if not model.nu:
@@ -84,6 +98,36 @@ def load_model(xml_file: ModelSource) -> Any:
         if model.numeric(number).name in _READ_BY_MJX:
             model.name_numericadr[number] = len(model.names) - 1  # a name of no letters
     return model
+
+
+def _nonfinite(model: Any) -> Iterator[str]:
+    """Yields where numbers of a model are not finite that a step reads: a field, and whose it is.
+
+    MuJoCo's compiler checks few of them.
+    """
+    for prefix, owner in (("", model), ("opt.", model.opt), ("stat.", model.stat)):
+        for field in dir(owner):
+            values = np.atleast_1d(getattr(owner, field))
+            if values.dtype.kind != "f" or _UNREAD.fullmatch(field):
+                continue
+            is_bad = np.isnan(values) if _MAY_BE_INFINITE.fullmatch(field) else ~np.isfinite(values)
+            if is_bad.any():
+                row = int(np.argwhere(is_bad)[0, 0])
+                yield f"{prefix}{field}{_owner(model, field, values, row)}"
+
+
+def _owner(model: Any, field: str, values: np.ndarray, row: int) -> str:
+    """Returns whose row of a field it is, for a message, or nothing where rows are no elements."""
+    kind = field.partition("_")[0]
+    count = getattr(model, f"n{kind}", None)
+    if kind in ("dof", "qpos", "qpos0"):
+        first_rows = model.jnt_dofadr if kind == "dof" else model.jnt_qposadr
+        row = int(np.searchsorted(first_rows, row, side="right")) - 1
+        kind = "jnt"
+        count = len(values)
+    if not hasattr(model, kind) or count != len(values):
+        return ""
+    return f" of {getattr(model, kind)(row).name or f'number {row}'}"
 
 
 def _name(xml_file: ModelSource) -> str:

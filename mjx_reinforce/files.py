@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import errno
 import io
 import json
 import keyword
@@ -19,6 +20,8 @@ import numpy as np
 from mjx_reinforce.engine.checks import explain
 from mjx_reinforce.engine.memory import gigabytes
 
+#: What the system says where no room is left, on the disk or of what this user may have of it.
+FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 #: What arrays may take that are read from an archive (bytes).
 _MAX_BYTES = 2**26
 #: Or, of a large archive, how often its own size.
@@ -38,9 +41,12 @@ def write_bytes(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary_path, path)
-    except BaseException:
+    except BaseException as error:
         with contextlib.suppress(FileNotFoundError):
             temporary_path.unlink()
+        # A write to a full disk names no file.
+        if isinstance(error, OSError) and error.filename is None:
+            error.filename = str(path)
         raise
     with contextlib.suppress(OSError):  # not every file system can; the file is whole without it
         _sync(path.parent)
@@ -160,9 +166,10 @@ def read_json(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise ValueError(f"cannot read {path} ({error.strerror})") from error
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
+        problem = error if path.stat().st_size else "it is empty"
+        raise ValueError(f"{path} is damaged: {problem}; put back a copy of it") from error
     if not isinstance(value, dict):
-        raise ValueError(f"{path} is damaged: it holds no JSON object")
+        raise ValueError(f"{path} is damaged: it holds no JSON object; put back a copy of it")
     return value
 
 

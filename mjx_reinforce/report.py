@@ -15,7 +15,7 @@ import tyro
 
 from mjx_reinforce.console.streams import say_error
 from mjx_reinforce.export.run_files import seeds_in
-from mjx_reinforce.files import check_output, csv_text, write_bytes
+from mjx_reinforce.files import FULL_ERRORS, check_output, csv_text, write_bytes
 from mjx_reinforce.reports import document, sources, words
 from mjx_reinforce.reports.charts import Table, render_chart, rows, short
 from mjx_reinforce.reports.document import encoded
@@ -82,6 +82,8 @@ def _report(settings: ReportSettings) -> None:
         reason = str(error)
         if not output.parent.is_dir():
             reason = f"{output.parent} was moved or removed"
+        elif error.errno in FULL_ERRORS:
+            reason += "; make room there"
         say_error(f"cannot write {output}: {reason}")
         sys.exit(1)
     size = f"{output.stat().st_size / 1e6:.1f} MB, {time.perf_counter() - start:.1f} s"

@@ -300,11 +300,21 @@ def _read_run(directory: Path, config: dict[str, Any]) -> Source:
     columns = read_metrics(directory / "metrics.csv")
     terms = {x.removeprefix("eval_"): columns.pop(x) for x in [*columns] if x not in _METRICS}
     num_seeds = len(columns["seed"])
+    if num_seeds != config.get("num_seeds", num_seeds):
+        raise ValueError(
+            f"{directory}/metrics.csv has {num_seeds} seeds, config.json {config['num_seeds']}: "
+            "they are of different runs; put back the one that was there"
+        )
     # The summary is written at the end; until then the run is read as far as it came.
     path = directory / "summary.json"
     summary: dict[str, Any] = {"status": "running"}
     if path.exists():
         summary = read_json(path)
+    if config["env"] != summary.get("env", config["env"]):
+        raise ValueError(
+            f"{path} is for {summary['env']}, config.json for {config['env']}: they are of "
+            "different runs; put back the one that was there"
+        )
     with naming_damage(path):
         # [S] counts; a run that goes on has none yet, and 0 stands for all seeds.
         counts = np.array(summary.get("nonfinite", 0), np.int64)
@@ -456,6 +466,9 @@ def read_columns(
     with naming_damage(path):  # csv has a class of errors of its own
         # A line without its end may have half a number.
         header, *rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines())) or [[]]
+        for line_number, row in enumerate(rows, start=2):
+            if len(row) != len(header):
+                raise ValueError(f"line {line_number} has {len(row)} entries, not {len(header)}")
         columns = {name: [] for name in header}
         if rows:
             columns = dict(zip(header, zip(*rows, strict=True), strict=True))

@@ -3,6 +3,7 @@
 import dataclasses
 import gc
 import os
+import shlex
 import sys
 import traceback
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.streams import accept_everything, say_error, silence_alarms
-from mjx_reinforce.files import MovedError
+from mjx_reinforce.files import FULL_ERRORS, MovedError
 from mjx_reinforce.runs.design import Design, SweepSettings, check_swept, read_design, read_over
 from mjx_reinforce.runs.perform import perform, report_on
 from mjx_reinforce.settings.config import (
@@ -271,11 +272,17 @@ def _refuse_full(error: RuntimeError | MemoryError | OSError, design: Design) ->
             refuse(str(MovedError(design.directory)), status=1)
         remedy = "try again"
         if any((design.directory / name).exists() for name in resume.FIRST_FILES):
-            remedy = f"go on with --resume {design.directory}{code_flags(vars(design.base))}"
-        # Errors of W&B have no number, and more room would not help.
-        room_advice = "make room, then" if error.errno else "then"
+            quoted = shlex.quote(str(design.directory))
+            remedy = f"go on with --resume {quoted}{code_flags(vars(design.base))}"
+        # Errors of W&B have no number, and there is nothing here to mend.
+        if error.errno in FULL_ERRORS:
+            advice = "make room, then"
+        elif error.errno:
+            advice = "mend that, then"
+        else:
+            advice = "then"
         file_owner = f"the files of this {design.kind}"
-        refuse(f"cannot write {file_owner} ({error}); {room_advice} {remedy}", status=1)
+        refuse(f"cannot write {file_owner} ({error}); {advice} {remedy}", status=1)
     if "machine code of a step was not compiled" in str(error):  # the words of cpu/waiting.ll
         refuse(str(error), status=1)
     # JAX reports a full device as a RuntimeError with this status in its text.

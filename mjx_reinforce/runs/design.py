@@ -13,7 +13,7 @@ from typing import Annotated, Any, get_origin
 import tyro
 
 from mjx_reinforce.console.commands import command
-from mjx_reinforce.engine.checks import check_name, nearest, read_as, spoken_kind
+from mjx_reinforce.engine.checks import check_name, check_type, nearest, read_as, spoken_kind
 from mjx_reinforce.engine.memory import gigabytes, host_memory
 from mjx_reinforce.files import naming_damage
 from mjx_reinforce.settings.config import (
@@ -131,7 +131,10 @@ def read_design(directory: Path) -> Design:
     record = read_record(directory)
     # Of the first files that of a sweep alone has this entry.
     if "over" not in record:
-        base = as_config(record, directory / "config.json")
+        record_path = directory / "config.json"
+        with naming_damage(record_path):
+            check_type("resumed", record.get("resumed", []), list)
+        base = as_config(record, record_path)
         return Design(base=dataclasses.replace(base, resume=directory))
     record_path = directory / "sweep.json"
     with naming_damage(record_path):

@@ -249,7 +249,8 @@ def percent_done(fraction: float) -> str:
 def summary_table(summary: dict[str, Any]) -> Table:
     """Returns the table that ends a run."""
     num_seeds = f"{summary['num_seeds']:,}"
-    table = Table(title=f"{summary['env']}, {num_seeds} seeds", show_header=False)
+    seeds = counted(summary["num_seeds"], "seed")
+    table = Table(title=f"{summary['env']}, {seeds}", show_header=False)
     if summary["race"] > 1:
         table.caption = (
             f"Each seed is the best of a race of {summary['race']} policies, by training returns; "

@@ -4,7 +4,6 @@ Its directory is made, tried and locked before anything heavy is imported.
 """
 
 import contextlib
-import errno
 import os
 import shlex
 import tempfile
@@ -25,7 +24,7 @@ from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.engine.cpu import emit
-from mjx_reinforce.files import check_place
+from mjx_reinforce.files import FULL_ERRORS, check_place
 from mjx_reinforce.runs.design import Design, check_design
 from mjx_reinforce.settings.config import code_flags
 from mjx_reinforce.training.resume import read_record
@@ -37,8 +36,6 @@ if TYPE_CHECKING:
 
 #: What a kill leaves of the first file of a run or a sweep, which then was not begun.
 _FIRST_PREFIXES = (".config.json.", ".sweep.json.")
-#: What the system says where no room is left, on the disk or of what this user may have of it.
-_FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 #: A disk with less room (bytes) is full: the files of a small run take about as much.
 _MIN_FREE_BYTES = 2**20
 
@@ -127,7 +124,7 @@ def own_directory(
         except OSError as error:
             remove_empty(new_folders)
             remedy = "make it a folder that you may write to"
-            if error.errno in _FULL_ERRORS:
+            if error.errno in FULL_ERRORS:
                 remedy = "make room there"
             if not resumed:
                 remedy += ", or choose another --output"
@@ -279,7 +276,7 @@ def report_on(outcome: Outcome, *, report: bool = True) -> None:
         return
     if summary["status"] == "interrupted":
         flags = code_flags(summary["settings"])
-        display.say(f"interrupted; go on with --resume {directory}{flags}")
+        display.say(f"interrupted; go on with --resume {shlex.quote(str(directory))}{flags}")
         return
     if outcome.driver is None and (directory / "report.html").exists():
         display.say(f"the sweep in {directory} is finished")

@@ -18,6 +18,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.commands import COMMANDS, command
 from mjx_reinforce.console.streams import accept_everything, say_error
 from mjx_reinforce.engine.checks import fits, nearest, read_as, whole_number
+from mjx_reinforce.files import FULL_ERRORS
 from mjx_reinforce.registry import is_own
 from mjx_reinforce.settings.config import flag, marked
 from mjx_reinforce.settings.declare import Range
@@ -145,7 +146,8 @@ def run_command(form: type[Form], name: str, do: Callable[[Form], object]) -> No
     try:
         do(read_command_line(form, sys.argv[1:], command(name)))
     except (ValueError, OSError) as error:
-        say_error(str(error))
+        is_full = isinstance(error, OSError) and error.errno in FULL_ERRORS
+        say_error(f"{error}{'; make room there' * is_full}")
         sys.exit(2)
     except (ImportError, MemoryError) as error:
         say_error(cannot_load(error))

@@ -21,7 +21,7 @@ import numpy as np
 
 from mjx_reinforce.engine.checks import fits
 from mjx_reinforce.files import Arrays, check_archive, read_json, write_bytes
-from mjx_reinforce.settings.config import Config, flag, marked
+from mjx_reinforce.settings.config import Config, check_each, flag, marked
 from mjx_reinforce.settings.declare import MAX_COUNT, Mark
 
 #: What may change when a run goes on: when it ends, and how often it is saved.
@@ -64,8 +64,8 @@ def read_record(directory: Path) -> dict[str, Any]:
             if not isinstance(error.__cause__, FileNotFoundError):
                 raise
     raise ValueError(
-        f"cannot resume {directory}: there is no {' or '.join(FIRST_FILES)}, so nothing was begun "
-        "there; start it anew with --output"
+        f"cannot resume {directory}: there is no {' or '.join(FIRST_FILES)}; put back a copy, or, "
+        "if nothing was begun there, start it anew with --output"
     )
 
 
@@ -85,7 +85,12 @@ def as_config(record: Mapping[str, Any], path: Path) -> Config:
         settings[name] = tuple(value) if isinstance(value, list) else value
         if not fits(settings[name], annotation):
             raise ValueError(f"{path} says {name} is {value!r}: it is {_DAMAGE}")
-    return Config(**settings)
+    config = Config(**settings)
+    try:
+        check_each(config)
+    except ValueError as error:  # which is of flags that nobody gave
+        raise ValueError(f"{path}: {error}") from error
+    return config
 
 
 def recordable(config: Config) -> dict[str, Any]:
@@ -280,9 +285,8 @@ def remove_checkpoints(folder: Path, last_number: int = 0) -> None:
 def _archives(folder: Path) -> list[Path]:
     """Returns the checkpoints in a folder, the newest first."""
     paths = folder.iterdir() if folder.is_dir() else ()
-    return sorted(
-        filter(lambda path: _FILE_NAME.fullmatch(path.name), paths), key=_number, reverse=True
-    )
+    archives = [path for path in paths if _FILE_NAME.fullmatch(path.name) and path.is_file()]
+    return sorted(archives, key=_number, reverse=True)
 
 
 def _number(path: Path) -> int:
@@ -384,42 +388,60 @@ def _form(array: np.ndarray) -> tuple[tuple[int, ...], str]:
 def newest_checkpoint(config: Config, say: Callable[[str], None]) -> Checkpoint | None:
     """Returns the newest usable checkpoint, or None: then the run starts again.
 
+    It does so where it has no checkpoint yet, or none that a larger budget passes through.
+
     Args:
       config: its settings, with the budget that it is to have.
       say: shows a line about each file that does not serve.
 
     Raises:
       ValueError: the budget is smaller than what the run did, config.json was edited, a checkpoint
-        is another version's, or there is none for a budget in time.
+        is another version's, or there is none for a budget in time. Or none is left of those that
+        were there, so that to start again would replace the policies.
     """
     if config.minutes is not None:  # more than any checkpoint has used
         config = dataclasses.replace(config, env_steps=MAX_COUNT)
-    assert config.resume is not None
-    metrics = config.resume / "metrics.csv"
-    num_bytes = metrics.stat().st_size if metrics.exists() else 0
+    directory = config.resume
+    assert directory is not None
+    metrics_path = directory / "metrics.csv"
+    metrics = metrics_path.read_bytes() if metrics_path.is_file() else b""
     settings = decisive(config)
-    for checkpoint in read_checkpoints(config.resume / "checkpoint", say):
+    has_whole = False
+    for checkpoint in read_checkpoints(directory / "checkpoint", say):
         # config.json is a file that people edit; a checkpoint is not.
         for name, value in (checkpoint.settings or {}).items():
             if settings.get(name) != value:
                 raise ValueError(
-                    f"{config.resume}/config.json says that {name} is {settings.get(name)}, but "
-                    f"the run was trained with {value}; put that back, or start another run"
+                    f"{directory}/config.json says that {name} is {settings.get(name)}, but the "
+                    f"run was trained with {value}; put that back, or start another run"
                 )
         # Rows are cut off down to a checkpoint's length; rows that are lost cannot come back.
-        if checkpoint.metrics_bytes > num_bytes:
-            say(
-                f"metrics.csv is shorter than at checkpoint {checkpoint.number}; trying the one "
-                "before"
-            )
+        if not _has_rows(metrics, checkpoint, config.num_seeds):
+            say(f"metrics.csv lacks rows of checkpoint {checkpoint.number}; trying the one before")
         elif _serves(checkpoint, config):
             return checkpoint
+        else:
+            has_whole = True
     if config.minutes is not None:
         raise ValueError(
-            f"{config.resume} has no checkpoint to go on from for {config.minutes:g} min; leave "
+            f"{directory} has no checkpoint to go on from for {config.minutes:g} min; leave "
             "--minutes out to train it again, or start another run"
         )
+    if not has_whole and (directory / "policy").exists():
+        raise ValueError(
+            f"{directory} has policies, but no whole checkpoint/ and metrics.csv to go on from, "
+            "and would train them from the beginning; put those back from a copy, or remove "
+            "policy/ and checkpoint/ to begin again"
+        )
     return None
+
+
+def _has_rows(metrics: bytes, checkpoint: Checkpoint, num_seeds: int) -> bool:
+    """Returns whether the bytes of metrics.csv begin with the rows that a checkpoint counts on."""
+    rows = metrics[: checkpoint.metrics_bytes]
+    # One a seed and evaluation, below the header. An editor may have changed the ends of lines.
+    num_lines = 1 + num_seeds * _num_rows(checkpoint, "evaluations")
+    return len(rows) == checkpoint.metrics_bytes and rows.count(b"\n") == num_lines
 
 
 def _serves(checkpoint: Checkpoint, config: Config) -> bool:

@@ -5,6 +5,7 @@ Tables of what is refused and in which words, then settings drawn at random.
 
 import contextlib
 import dataclasses
+import errno
 import math
 import os
 import re
@@ -41,6 +42,7 @@ from mjx_reinforce.settings.config import (
 )
 from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.defaults import PRESETS
+from mjx_reinforce.settings.flags import run_command
 from mjx_reinforce.settings.groups import Reader
 from mjx_reinforce.setup.build import build
 
@@ -420,6 +422,28 @@ def test_help_may_be_cut_off_or_go_nowhere():
     line = "; ".join(f"{command} {way}; echo ${{PIPESTATUS[0]}} >&3" for way in ways)
     done = subprocess.run(["bash", "-c", f"({line}) 3>&1"], capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("0\n" * len(ways), "")
+
+
+@dataclasses.dataclass
+class NoSettings:
+    """A command without flags."""
+
+
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (errno.ENOSPC, "error: [Errno 28] No space left on device: 'out.npz'; make room there\n"),
+        (errno.EACCES, "error: [Errno 13] Permission denied: 'out.npz'\n"),
+    ],
+)
+def test_a_command_that_meets_a_full_disk_asks_for_room(monkeypatch, capsys, number, said):
+    def write(_):
+        raise OSError(number, os.strerror(number), "out.npz")
+
+    monkeypatch.setattr(sys, "argv", ["export"])
+    with pytest.raises(SystemExit, match="2"):
+        run_command(NoSettings, "export", write)
+    assert capsys.readouterr().err == said
 
 
 def test_words_that_nobody_reads_end_no_sweep_of_a_script(monkeypatch):

@@ -129,6 +129,11 @@ FULL = [
         1,
         "the files of this run ([Errno 28] No space left); make room, then try again",
     ),
+    (
+        IsADirectoryError(errno.EISDIR, "Is a directory", "out/summary.json"),
+        1,
+        "([Errno 21] Is a directory: 'out/summary.json'); mend that, then try again",
+    ),
     (OSError("no network"), 1, "the files of this run (no network); then try again"),
 ]
 
@@ -154,6 +159,16 @@ def test_what_is_full_is_said_in_one_line(failing, tmp_path, capsys, error, stat
     assert failing(error) == status
     assert " ".join(capsys.readouterr().err.split()).endswith(said)
     assert not (tmp_path / "out").exists()
+
+
+def test_the_flag_that_goes_on_may_be_copied_to_a_shell(run, tmp_path, monkeypatch, capsys):
+    def conduct(*_):
+        (tmp_path / "my run" / "config.json").write_text("{}")
+        raise OSError(errno.ENOSPC, "No space left")
+
+    monkeypatch.setattr("mjx_reinforce.runs.conduct.conduct", conduct)
+    assert run(*ARGUMENTS, "--output", "my run") == 1
+    assert "then go on with --resume 'my run'" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_mistake_of_ours_in_training_is_no_bad_input(failing):

@@ -63,7 +63,7 @@ def test_a_last_evaluation_that_is_not_whole_is_left_out(run, end):
         (HEADER, "has no evaluation yet"),
         ("seed,env_steps\n0,1\n", "eval_return is missing"),
         (HEADER + "0,10,high,2\n", "could not convert .* 'high'"),
-        (HEADER + ROWS[0] + "1,12\n", "is shorter"),
+        (HEADER + ROWS[0] + "1,12\n", "metrics.csv is damaged: line 3 has 2 entries, not 4"),
         (HEADER + "".join(ROWS[i] for i in (0, 1, 3, 2)), "order of the seeds"),
         (HEADER + ROWS[0] + ROWS[0] + ROWS[1], "order of the seeds"),
         (HEADER + "0,10,1.5," + 131_073 * "2" + "\n", "metrics.csv is damaged: .*field larger"),
@@ -112,6 +112,24 @@ def test_a_table_that_cannot_be_read(run):
 def test_a_damaged_file_of_a_run_is_named(run, name, entry, said):
     (run / f"{name}.json").write_text(json.dumps(entry))
     with pytest.raises(ValueError, match=f"{name}.json is damaged: .*{said}"):
+        read_directory(run)
+
+
+@pytest.mark.parametrize(
+    ("config", "summary", "said"),
+    [
+        (
+            {"num_seeds": 3},
+            {},
+            "metrics.csv has 2 seeds, config.json 3: they are of different runs",
+        ),
+        ({}, {"env": "Ant-v5"}, "summary.json is for Ant-v5, config.json for Hopper-v5"),
+    ],
+)
+def test_files_of_two_runs_are_named(run, config, summary, said):
+    (run / "config.json").write_text(json.dumps({"env": "Hopper-v5", "num_seeds": 2} | config))
+    (run / "summary.json").write_text(json.dumps({"status": "running"} | summary))
+    with pytest.raises(ValueError, match=said):
         read_directory(run)
 
 

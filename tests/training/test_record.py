@@ -252,6 +252,9 @@ def test_the_end_table_has_counts(monkeypatch):
     monkeypatch.setattr(display, "_Screen", lambda **_: console)
     few = summarize(two, 950.0) | more | {"num_seeds": 2}
     display.Display().show_summary(few, Path("t"))
+    display.Display().show_summary(few | {"num_seeds": 1}, Path("t"))
+    titles = [x.strip() for x in console.file.getvalue().splitlines() if "Task-v0" in x]
+    assert titles == ["Task-v0, 2 seeds", "Task-v0, 1 seed"]
     assert "586.8 (no interval below six seeds)" in " ".join(console.file.getvalue().split())
     console = screen(80)
     ended = summarize(history, 950.0) | more

@@ -82,25 +82,67 @@ def checkpoints(directory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("damage", ["newest", "all", "table"])
+@pytest.mark.parametrize("damage", ["newest", "folder", "table"])
 def test_what_is_damaged_costs_an_interval(run, trained, parts, capsys, damage):
-    old, new = checkpoints(parts)
+    *_, new = checkpoints(parts)
     metrics = parts / "metrics.csv"
     if damage == "table":
         metrics.write_bytes(metrics.read_bytes()[:-7])
-        said = ["metrics.csv is shorter than at checkpoint 4", "going on after 15 updates"]
+        said = ["metrics.csv lacks rows of checkpoint 4", "going on after 15 updates"]
+    elif damage == "folder":
+        new.unlink()
+        new.mkdir()
+        said = ["going on after 15 updates"]
     else:
         new.write_bytes(new.read_bytes()[:-1] + b"!")
         said = [f"checkpoint {new.name} is damaged; trying the one before"]
-        said.append(f"going on after {0 if damage == 'all' else 15} updates")
+        said.append("going on after 15 updates")
         with metrics.open("a") as file:
             file.write("0,25,half a ro")
-    if damage == "all":
-        old.unlink()
     assert run("--resume", "parts") == 0
     assert_same(trained, parts)
     output = capsys.readouterr().out
     assert all(words in output for words in said)
+
+
+def lose_checkpoints(directory):
+    for path in checkpoints(directory):
+        path.write_bytes(b"")
+
+
+def lose_folder(directory):
+    shutil.rmtree(directory / "checkpoint")
+    (directory / "checkpoint").write_text("")
+
+
+def lose_metrics(directory):
+    (directory / "metrics.csv").unlink()
+
+
+def edit_metrics(directory):
+    """Saves the file as an editor of Windows does: no byte of a number is another."""
+    metrics = directory / "metrics.csv"
+    metrics.write_bytes(metrics.read_bytes().replace(b"\n", b"\r\n"))
+
+
+@pytest.mark.parametrize("lose", [lose_checkpoints, lose_folder, lose_metrics, edit_metrics])
+def test_policies_are_not_replaced_unasked(run, parts, capsys, lose):
+    lose(parts)
+    before = {path: path.read_bytes() for path in parts.rglob("*") if path.is_file()}
+    assert run("--resume", "parts") == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "parts has policies, but no whole checkpoint/ and metrics.csv" in error
+    assert before == {path: path.read_bytes() for path in parts.rglob("*") if path.is_file()}
+
+
+@pytest.mark.slow
+def test_who_removes_the_policies_begins_again(run, trained, parts, capsys):
+    lose_metrics(parts)
+    shutil.rmtree(parts / "checkpoint")
+    shutil.rmtree(parts / "policy")
+    assert run("--resume", "parts") == 0
+    assert "there is no checkpoint yet, so it begins again" in capsys.readouterr().out
+    assert_same(trained, parts)
 
 
 def test_a_checkpoint_that_is_cut_or_compressed_is_none(trained, tmp_path):
@@ -319,6 +361,9 @@ REFUSED = [
     ("", {"one_start": True}, "has other settings (one_start): it is damaged, or of another"),
     ("", {"eval_every": None}, "eval_every is None: it is damaged, or of another version of the"),
     ("", {"engine": "kernel"}, "engine is 'kernel': it is damaged"),
+    ("", {"learning_rate": -1.0}, "parts/config.json: --learning-rate must be positive"),
+    ("", {"env": "Nothing-v9"}, "parts/config.json: unknown environment 'Nothing-v9'"),
+    ("", {"resumed": 3}, "parts/config.json is damaged: resumed must be"),
 ]
 
 
@@ -349,7 +394,9 @@ def test_what_is_no_run_is_named(run, tmp_path, capsys):
         if content is not None:
             (tmp_path / "out" / "config.json").write_text(content)
         assert run("--resume", "out") == 2
-        assert "config.json" in capsys.readouterr().err
+        error = " ".join(capsys.readouterr().err.split())
+        assert "config.json" in error
+        assert ("put back a copy" in error) == (content != "{}")
 
 
 def test_two_processes_do_not_train_in_one_directory(run, parts, capsys):
