@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from mjx_reinforce.engine.base import MjModel
+from mjx_reinforce.envs import models
 from mjx_reinforce.envs.c_mujoco.in_mujoco import was_reset
 
 #: MuJoCo's own names; it is a C extension without stubs.
@@ -166,6 +167,7 @@ def _explosion(model: MjModel, wait: float, unfinished: str | None = None) -> st
 
 def _play(model: MjModel, controls: Iterator[np.ndarray], deadline: float) -> str | None:
     """Returns after what time and where a model explodes under controls [A], if it does."""
+    model = models.for_c(model)
     data = _C.MjData(model)
     if model.nkey:
         _C.mj_resetDataKeyframe(model, data, 0)

@@ -91,12 +91,22 @@ def load_model(xml_file: ModelSource) -> Any:
     model.opt.enableflags &= ~_ONLY_REPORTS
     if is_off(model, "constraint"):  # C looks for no contacts then, MJX does
         model.opt.disableflags |= _C.mjtDisableBit.mjDSBL_CONTACT
-    if model.opt.solver == _C.mjtSolver.mjSOL_NEWTON and _C.mj_isSparse(model):
-        # MuJoCo 4.0.0 factorizes some sparse Hessians wrongly (findings/copies_of_five_masses.sh).
-        model.opt.jacobian = _C.mjtJacobian.mjJAC_DENSE
     for number in range(model.nnumeric):
         if model.numeric(number).name in _READ_BY_MJX:
             model.name_numericadr[number] = len(model.names) - 1  # a name of no letters
+    return model
+
+
+def for_c(model: Any) -> Any:
+    """Returns the model as C MuJoCo is to step it: a copy where something has to differ.
+
+    MuJoCo 4.0.0 factorizes some sparse Hessians of Newton's method wrongly
+    (findings/copies_of_five_masses.sh). MJX has another method where constraints are sparse.
+    """
+    if model.opt.solver != _C.mjtSolver.mjSOL_NEWTON or not _C.mj_isSparse(model):
+        return model
+    model = copy.copy(model)
+    model.opt.jacobian = _C.mjtJacobian.mjJAC_DENSE
     return model
 
 

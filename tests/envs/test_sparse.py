@@ -2,10 +2,14 @@
 
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from mjx_reinforce.envs import models
+from mjx_reinforce.envs.base import MujocoEnv
+from mjx_reinforce.envs.c_mujoco.in_mujoco import InMujoco
 
 _C: Any = mujoco
 #: Ties of five masses that MuJoCo 4.0.0's Newton's method gets wrong if the constraints are sparse.
@@ -29,6 +33,22 @@ def copies_of_five_masses(num_copies: int, options: str = "") -> Any:
       <actuator><motor joint="j0"/></actuator></mujoco>""")
 
 
+class Masses(MujocoEnv):
+    """Masses that begin at rest; nothing is paid."""
+
+    def __init__(self, model: Any):
+        super().__init__(xml_file=model, frame_skip=1, max_episode_steps=10, reward_threshold=None)
+
+    def initial(self, rng):
+        return jnp.asarray(self.mj_model.qpos0), jnp.zeros(self.mj_model.nv)
+
+    def outcome(self, before, data, action):
+        return 0.0, False, {}
+
+    def observe(self, data):
+        return data.qpos
+
+
 def accelerations(model: Any) -> np.ndarray:
     """Returns the accelerations (m/s2) of the masses in the model's pose."""
     data = _C.MjData(model)
@@ -39,13 +59,27 @@ def accelerations(model: Any) -> np.ndarray:
 def test_copies_of_masses_move_as_the_masses_do_alone():
     sparse_model = copies_of_five_masses(12)
     assert _C.mj_isSparse(sparse_model)
-    loaded = models.load_model(sparse_model)
+    loaded = models.for_c(models.load_model(sparse_model))
     alone = accelerations(copies_of_five_masses(1))
     np.testing.assert_allclose(accelerations(loaded), np.tile(alone, (12, 1)), atol=1e-6)
     assert _C.mj_isSparse(sparse_model), "the user's own model has changed"
 
 
-def test_other_solvers_keep_sparse_constraints():
+def test_other_solvers_and_mjx_keep_sparse_constraints():
     for solver in ("CG", "PGS"):
         loaded = models.load_model(copies_of_five_masses(12, f'solver="{solver}"'))
-        assert _C.mj_isSparse(loaded)
+        assert _C.mj_isSparse(models.for_c(loaded))
+    assert _C.mj_isSparse(models.load_model(copies_of_five_masses(12)))
+
+
+def test_engines_of_c_mujoco_have_dense_constraints():
+    env = Masses(copies_of_five_masses(12))
+    alone = accelerations(copies_of_five_masses(1))
+    simulation = InMujoco(env)
+    simulation.reset(jax.random.key(0))
+    np.testing.assert_allclose(simulation.data.qacc, np.tile(alone[0], 12), atol=1e-6)
+    batch: Any = env.in_c_mujoco()
+    state = jax.jit(jax.vmap(batch.reset))(jax.random.split(jax.random.key(0), 2))
+    state = jax.jit(jax.vmap(batch.step))(state, jnp.zeros((2, env.action_size)))
+    speeds = np.asarray(state.pipeline_state.qvel) / env.mj_model.opt.timestep
+    np.testing.assert_allclose(speeds, np.tile(alone[0], (2, 12)), rtol=1e-4, atol=0.1)
