@@ -3,7 +3,6 @@
 They run on the CPU unless JAX_PLATFORMS names something else.
 """
 
-import gc
 import os
 import sys
 from importlib.metadata import version
@@ -33,8 +32,6 @@ import pytest
 from command_lines import added_environments, run_command
 from places import WITHOUT_WARP
 
-# Tracing makes many objects and little garbage; the command lines of this package ask for the same.
-gc.set_threshold(100_000)
 # Where Playground has installed Warp, MJX imports it, which takes longer than all else that it
 # imports. Processes that tests start do without. The workers inherit the path, and do not.
 _PATHS = [x for x in os.environ.get("PYTHONPATH", "").split(os.pathsep) if x]
@@ -48,7 +45,6 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if item.get_closest_marker("cpu") and jax.default_backend() != "cpu":
             item.add_marker(pytest.mark.skip(reason="it is for CPUs"))
-    gc.freeze()  # what was imported stays
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 
