@@ -167,7 +167,7 @@ def _explosion(model: MjModel, wait: float, unfinished: str | None = None) -> st
 
 def _play(model: MjModel, controls: Iterator[np.ndarray], deadline: float) -> str | None:
     """Returns after what time and where a model explodes under controls [A], if it does."""
-    model = models.for_c(model)
+    model = models.c_model(model)
     data = _C.MjData(model)
     if model.nkey:
         _C.mj_resetDataKeyframe(model, data, 0)

@@ -97,7 +97,7 @@ def load_model(xml_file: ModelSource) -> Any:
     return model
 
 
-def for_c(model: Any) -> Any:
+def c_model(model: Any) -> Any:
     """Returns the model as C MuJoCo is to step it: a copy where something has to differ.
 
     MuJoCo 4.0.0 factorizes some sparse Hessians of Newton's method wrongly

@@ -65,7 +65,7 @@ class InBatch(Env):
             for name in models.CONSTANT
         }
         self._simulations = Simulations(
-            models.for_c(env.mj_model),
+            models.c_model(env.mj_model),
             fields,
             randomized,
             contact_forces=env.contact_forces,

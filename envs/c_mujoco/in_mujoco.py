@@ -55,7 +55,7 @@ class InMujoco:
         if not isinstance(env, MujocoEnv) or (task.reset, task.step) != methods:
             raise ValueError(f"{task.__name__} has steps of its own, which MuJoCo does not know")
         self.env = env
-        self.model = models.for_c(env.mj_model)
+        self.model = models.c_model(env.mj_model)
         self.data = _C.MjData(self.model)
         self._episode, _ = jax.eval_shape(env.draw, jax.random.key(0))
         recorder: Any = FieldRecorder(self.data, env.mj_model)
@@ -81,7 +81,7 @@ class InMujoco:
         memory_rng, rng = self._split(rng)
         self._episode, start = self._start(rng)
         # A copy, since an episode may replace fields of the model.
-        self.model = model = copy.copy(models.for_c(self.env.mj_model))
+        self.model = model = copy.copy(models.c_model(self.env.mj_model))
         data = _C.MjData(model)
         if model_fields := models.replaced(self._episode):
             for name, field in model_fields.items():

@@ -59,7 +59,7 @@ def accelerations(model: Any) -> np.ndarray:
 def test_copies_of_masses_move_as_the_masses_do_alone():
     sparse_model = copies_of_five_masses(12)
     assert _C.mj_isSparse(sparse_model)
-    loaded = models.for_c(models.load_model(sparse_model))
+    loaded = models.c_model(models.load_model(sparse_model))
     alone = accelerations(copies_of_five_masses(1))
     np.testing.assert_allclose(accelerations(loaded), np.tile(alone, (12, 1)), atol=1e-6)
     assert _C.mj_isSparse(sparse_model), "the user's own model has changed"
@@ -68,7 +68,7 @@ def test_copies_of_masses_move_as_the_masses_do_alone():
 def test_other_solvers_and_mjx_keep_sparse_constraints():
     for solver in ("CG", "PGS"):
         loaded = models.load_model(copies_of_five_masses(12, f'solver="{solver}"'))
-        assert _C.mj_isSparse(models.for_c(loaded))
+        assert _C.mj_isSparse(models.c_model(loaded))
     assert _C.mj_isSparse(models.load_model(copies_of_five_masses(12)))
 
 
