@@ -27,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 from jax import lax
+from mujoco import mjx
 
 from experiments.checks.mechanisms import FORCES, MOTOR, Mechanism, Start, failures, mechanisms
 from mjx_reinforce import normal
@@ -49,8 +50,18 @@ FIELDS = (
     *("qpos", "qvel", "act", "qacc", "sensordata", "ten_length", "actuator_length"),
     *("actuator_force", "qfrc_bias", "qfrc_passive", "qfrc_actuator", "qfrc_constraint"),
 )
+#: Passes of XLA that make loops faster, which run for a few steps.
+_PASSES = (
+    "simplify-while-loops",
+    "while-loop-constant-sinking",
+    "while-loop-invariant-code-motion",
+)
 #: How XLA compiles what runs once.
-_QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+_QUICK = {
+    "xla_backend_optimization_level": 0,
+    "xla_llvm_disable_expensive_passes": True,
+    "xla_disable_hlo_passes": ",".join(_PASSES),
+}
 #: The lot by which CI's part of the matrix is drawn, and so many mechanisms of a program.
 _SEED = 62
 _SAMPLED = 10
@@ -151,20 +162,25 @@ def by_c_as_is(model: Any, start: Start, steps: int) -> list[np.ndarray]:
 def by_us(model: Any, starts: Start, steps: int) -> list[np.ndarray]:
     """Returns each field after every step from every start, [S, T, ...], by no engine."""
     in_mjx = models.to_mjx(model, "it")
-    forward = jax.jit(functools.partial(physics.forward, in_mjx))
+    forward = functools.partial(physics.forward, in_mjx)
+    if in_mjx.opt.integrator == mjx.IntegratorType.RK4:  # which calls it four times
+        forward = jax.jit(forward)
+
+    def begin(qpos: Any, qvel: Any, act: Any) -> Any:
+        return models.make_data(model).replace(qpos=qpos, qvel=qvel, act=act)
+
+    def step(data: Any, ctrl: Any) -> tuple[Any, list[jax.Array]]:
+        given = data.replace(ctrl=control(ctrl, data.time, jnp))
+        data = physics.like(physics.step(in_mjx, given, forward), data)
+        return data, fields(Simulation(rne_postconstraint(in_mjx, data)))
 
     def play(start: Start) -> list[jax.Array]:
-        def step(data: Any, _: None) -> tuple[Any, list[jax.Array]]:
-            given = data.replace(ctrl=control(ctrl, data.time, jnp))
-            data = physics.like(physics.step(in_mjx, given, forward), data)
-            return data, fields(Simulation(rne_postconstraint(in_mjx, data)))
+        # A step of all starts is traced once; a loop that is batched would be traced thrice.
+        data = jax.vmap(begin)(*start[:3])
+        return lax.scan(lambda data, _: jax.vmap(step)(data, start[3]), data, None, steps)[1]
 
-        qpos, qvel, act, ctrl = start
-        data = models.make_data(model).replace(qpos=qpos, qvel=qvel, act=act)
-        return lax.scan(step, data, None, steps)[1]
-
-    shown = jax.jit(jax.vmap(play), compiler_options=_QUICK)(starts)
-    return [np.asarray(x).reshape(*x.shape[:2], -1) for x in shown]
+    shown = jax.jit(play, compiler_options=_QUICK)(starts)
+    return [np.asarray(x).swapaxes(0, 1).reshape(*x.shape[1::-1], -1) for x in shown]
 
 
 def by_machine_code(model: Any, start: Start, steps: int) -> list[np.ndarray]:
