@@ -78,15 +78,13 @@ _PLAYGROUND = "playground:"
 _CREDIT_SECONDS = 2.0
 #: The limit of an update, for each entry of an action (nats). That of several entries is the sum
 #: of theirs; of Gymnasium's tasks, those found for many episodes are 0.005 to 0.019 an entry.
-_ENTRY_KL = 0.0125
+_ENTRY_KL = 0.025
 #: Training episodes are cut after so long at first (s).
 _CUT_SECONDS = 10.0
 for _name, (_num_entries, _seconds) in SUITE.items():
     _figures = {
         "discount": 1 - _seconds / _CREDIT_SECONDS,
         "max_kl": _ENTRY_KL * _num_entries,
-        # All entries together begin with the same noise, in units of half their range.
-        "initial_std": _num_entries**-0.5,
         "train_horizon": round(_CUT_SECONDS / _seconds),
     }
     OF_TASKS[_PLAYGROUND + _name] = _TUNED["suite"] | _figures

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.engine.devices import NONE, RUNS, SECOND, check_room, executable
+from mjx_reinforce.engine.gpu import seam as gpu_seam
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import Config
@@ -361,6 +362,7 @@ def compile_slots(programs: Programs, config: Config, width: int) -> Compiled:
     evaluate = evaluate_task.result()
     check_fits(advance)
     check_fits(evaluate)
+    gpu_seam.wait_for_kernels()
     # Without a run: a GPU's driver translates the kernels of a program when it first runs.
     jax.block_until_ready(advance(rows, no_budget, occupied, no_evaluation))
     return Compiled(begin, advance, evaluate, width, programs, config)

@@ -28,6 +28,23 @@ def write_episodes(folder, task, ours, theirs):
     rows.append(folder / "agreement.csv", lines, columns)
 
 
+def test_sweeps_of_several_tasks_share_a_table(tmp_path):
+    """An action of CartpoleSwingup has one entry, one of WalkerRun six."""
+    columns = ("task", "max_kl", "initial_std", "entropy_cost", "seed", "final_return")
+    lines = [
+        ("WalkerRun", 0.15, 1, 0, 0, 500),
+        ("WalkerRun", 0.15, 1, 0, 1, 600),
+        ("WalkerRun", 0.075, 0.41, 0, 0, 300),
+        ("CartpoleSwingup", 0.025, 1, 0, 0, 850),
+        ("CartpoleSwingup", 0.0125, 0.99, 0, 0, 7),
+    ]
+    rows.write(tmp_path / tables.SETTINGS, [dict(zip(columns, x, strict=True)) for x in lines])
+    assert tables.settings(tmp_path).splitlines()[2:] == [
+        "| 0.0125 n | 1 / sqrt(n) | 0 | 300.0 (300.0) | 7.00 (7.00) |",
+        "| 0.025 n | 1 | 0 | 550.0 (500.0) | 850.0 (850.0) |",
+    ]
+
+
 def test_a_page_is_made_of_what_is_kept(tmp_path):
     data = tmp_path / "data"
     data.mkdir()

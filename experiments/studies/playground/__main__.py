@@ -91,6 +91,7 @@ def write(data: Path, page: Path) -> None:
         "after a minute": partial(tables.after_a_minute, data),
         "agreement": partial(tables.agreement, data),
         "speeds": partial(tables.speeds, data),
+        "settings": partial(tables.settings, data),
     }
     page.write_text(filled(page.read_text("utf-8"), texts), encoding="utf-8")
 

@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from experiments.kit.rows import read
 from experiments.speed.benchmark import rows as benchmark_rows
 from experiments.studies.playground.runs import TASKS
 from experiments.studies.results.tables import compare, estimate, number
+from mjx_reinforce.settings.defaults import SUITE
 from mjx_reinforce.statistics import estimate_mean
 
 RETURNS, AGREEMENT, PUBLISHED = "returns.csv", "agreement.csv", "published.csv"
@@ -19,6 +21,8 @@ RETURNS, AGREEMENT, PUBLISHED = "returns.csv", "agreement.csv", "published.csv"
 PUBLISHED_SECONDS = "published_seconds.csv"
 #: Rows of ``experiments.speed.benchmark gpu --tasks playground:...``.
 SPEEDS = "speeds.csv"
+#: Final returns of sweeps over settings, a row for each seed.
+SETTINGS = "settings.csv"
 _RIVALS = ("Playground, MJX", "Playground, MJX-Warp")
 
 
@@ -160,6 +164,23 @@ def speeds(data: Path) -> str:
         lines.append([task, *cells, *(f"{x:.1f}" for x in ratios)])
     header = ["task", "ours, rollout", "ours, `make_vec`", *_RIVALS]
     return table([*header, "`make_vec` / the better", "rollout / the better"], lines)
+
+
+def settings(data: Path) -> str:
+    """Returns the table of sweeps over settings: of each combination the tasks' means and worst."""
+    returns_of: dict[tuple[str, str, str], dict[str, list[float]]] = {}
+    for row in read(data / SETTINGS):
+        num_entries, _ = SUITE[row["task"]]
+        std = "1" if float(row["initial_std"]) == 1 else "1 / sqrt(n)"
+        kl = f"{float(row['max_kl']) / num_entries:g} n"
+        by_task = returns_of.setdefault((kl, std, row["entropy_cost"]), {})
+        by_task.setdefault(row["task"], []).append(float(row["final_return"]))
+    tasks = list(dict.fromkeys(task for by_task in returns_of.values() for task in by_task))
+    lines = [
+        [*combination, *(f"{number(fmean(of[x]))} ({number(min(of[x]))})" for x in tasks)]
+        for combination, of in sorted(returns_of.items())
+    ]
+    return table(["`--max-kl`", "`--initial-std`", "`--entropy-cost`", *tasks], lines)
 
 
 def agreement(data: Path) -> str:

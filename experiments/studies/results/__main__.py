@@ -101,6 +101,7 @@ def write(data: Path, docs: Path, readme: Path) -> None:
         "tasks": partial(tables.of_tasks, results),
         "pendulum": partial(tables.pendulum, pendulum),
         "optimum": partial(tables.distances, kept.optimum(data)),
+        "racing": partial(tables.racing, kept.racing(data)),
         "results": partial(tables.readme, groups, docs),
     }
     for page in (docs / "results.md", readme):

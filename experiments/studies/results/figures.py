@@ -30,7 +30,7 @@ def draw(folder: Path, docs: Path, path: Path) -> None:
     peers = kept.peers(docs / "peers.csv")
     tasks = list(dict.fromkeys(kept.env_id(group.task) for group in kept.clock(folder)))
     rows = -(-len(tasks) // 4)
-    figure = Figure(figsize=(13.4, 0.6 + 2.7 * rows), dpi=100, layout="constrained")
+    figure = Figure(figsize=(13, 0.6 + 2.6 * rows), dpi=100, layout="constrained")
     for number, task in enumerate(tasks, 1):
         ax = figure.add_subplot(rows, 4, number)
         for (name, device), curve in curves.items():

@@ -30,6 +30,7 @@ MINUTE = 60.0
 _POINTS = 40
 _SEEDS, _CURVES, _PLAYED = "seconds.csv", "seconds-curves.csv", "seconds-play-"
 _OPTIMUM = "optimum.csv"
+_RACING = "racing.csv"
 _COLUMNS = ("task", "device", "root", "seed", "status", "commit", "minute", "final", "best")
 _COLUMNS += ("seconds", "env_steps", "compile_seconds")
 _CURVE = ("seconds", "mean", "low", "high")
@@ -227,6 +228,11 @@ def clock(folder: Path) -> list[Group]:
 def optimum(folder: Path) -> list[dict[str, str]]:
     """Returns what is kept of searches for the optimum, a row for each start."""
     return _read(folder / _OPTIMUM)
+
+
+def racing(folder: Path) -> list[dict[str, str]]:
+    """Returns what is kept of races beside independent runs, a row for each arm."""
+    return _read(folder / _RACING)
 
 
 def curves(folder: Path) -> dict[tuple[str, str], Columns]:

@@ -100,6 +100,22 @@ def _distance_row(starts: Sequence[Mapping[str, str]]) -> list[str]:
     ]
 
 
+def racing(arms: Sequence[Mapping[str, str]]) -> str:
+    """Returns the table of races beside independent runs, from the rows of racing.csv."""
+    header = ["task", "policies that are tested", "mean (95%)", "worst", "best"]
+    return table([*header, "seconds, all runs", "env steps, all runs"], map(_arm_row, arms))
+
+
+def _arm_row(arm: Mapping[str, str]) -> list[str]:
+    mean, low, high, worst, best = (
+        number(float(arm[name])) for name in ("mean", "low", "high", "worst", "best")
+    )
+    tested = f"{arm['policies']}, {arm['arm']}"
+    returns = [f"{mean} ({low} to {high})", worst, best]
+    cost = [seconds(float(arm["seconds"])), _steps_of(float(arm["env_steps"]))]
+    return [arm["task"], tested, *returns, *cost]
+
+
 def pendulum(results: Sequence[Result]) -> str:
     """Returns how soon and how surely the pendulum is solved, by the evaluations on the way."""
     rows = []

@@ -22,6 +22,8 @@ from mjx_reinforce.engine.gpu.source import WARP
 
 #: XLA's names of the handlers that it knows.
 _HANDLERS: set[str] = set()
+#: What compiles the kernels of the handlers.
+_COMPILERS: list[threading.Thread] = []
 _LOCK = threading.Lock()
 
 
@@ -85,9 +87,22 @@ def _handler(kernel: cubin.Kernel) -> str:
             jax.ffi.register_ffi_target(name, address, platform="CUDA")
             # A daemon, so that a program that ends early need not wait for NVIDIA's compiler.
             arguments = (slot, kernel, compute_capability(), objects.folder())
-            threading.Thread(target=cubin.fill, args=arguments, daemon=True).start()
+            compiler = threading.Thread(target=cubin.fill, args=arguments, daemon=True)
+            compiler.start()
+            _COMPILERS.append(compiler)
             _HANDLERS.add(name)
     return name
+
+
+def wait_for_kernels() -> None:
+    """Waits until all kernels that programs launch are compiled: a launch would wait for its own.
+
+    So the time that NVIDIA's compiler needs is not counted as that of what launches them.
+    """
+    with _LOCK:
+        compilers = tuple(_COMPILERS)
+    for compiler in compilers:
+        compiler.join()
 
 
 def compute_capability() -> str:

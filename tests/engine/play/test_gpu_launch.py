@@ -242,6 +242,24 @@ def test_a_program_calls_the_handler(in_memory, monkeypatch, tmp_path):
     assert filled == [(KERNEL, "9.0", tmp_path)]
 
 
+def test_one_can_wait_for_kernels(in_memory, monkeypatch):
+    """Whoever measures the time of launches does not measure the compiler's."""
+    monkeypatch.setattr(seam, "_COMPILERS", [])
+    monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
+    may_end, ended = threading.Event(), []
+
+    def fill(*_):
+        may_end.wait(60)
+        ended.append(True)
+
+    monkeypatch.setattr(cubin, "fill", fill)
+    seam._handler(KERNEL)
+    threading.Timer(0.2, may_end.set).start()
+    assert not ended
+    seam.wait_for_kernels()
+    assert ended
+
+
 def test_an_exported_program_finds_its_kernel_again(in_memory, monkeypatch, tmp_path):
     filled, registered = in_memory
     monkeypatch.setattr(seam, "_why_not_compiled", lambda: None)
