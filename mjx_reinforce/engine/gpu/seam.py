@@ -20,10 +20,8 @@ from mjx_reinforce.engine.gpu import cubin, loops, nvrtc
 from mjx_reinforce.engine.gpu import team_kernel as team
 from mjx_reinforce.engine.gpu.source import WARP
 
-#: XLA's names of the handlers that it knows.
-_HANDLERS: set[str] = set()
-#: What compiles the kernels of the handlers.
-_COMPILERS: list[threading.Thread] = []
+#: XLA's names of the handlers that it knows, and what compiles the kernel of each.
+_HANDLERS: dict[str, threading.Thread] = {}
 _LOCK = threading.Lock()
 
 
@@ -87,20 +85,15 @@ def _handler(kernel: cubin.Kernel) -> str:
             jax.ffi.register_ffi_target(name, address, platform="CUDA")
             # A daemon, so that a program that ends early need not wait for NVIDIA's compiler.
             arguments = (slot, kernel, compute_capability(), objects.folder())
-            compiler = threading.Thread(target=cubin.fill, args=arguments, daemon=True)
-            compiler.start()
-            _COMPILERS.append(compiler)
-            _HANDLERS.add(name)
+            _HANDLERS[name] = threading.Thread(target=cubin.fill, args=arguments, daemon=True)
+            _HANDLERS[name].start()
     return name
 
 
 def wait_for_kernels() -> None:
-    """Waits until all kernels that programs launch are compiled: a launch would wait for its own.
-
-    So the time that NVIDIA's compiler needs is not counted as that of what launches them.
-    """
+    """Waits until all kernels are compiled, so that no launch waits while its time is taken."""
     with _LOCK:
-        compilers = tuple(_COMPILERS)
+        compilers = list(_HANDLERS.values())
     for compiler in compilers:
         compiler.join()
 

@@ -207,7 +207,7 @@ def test_there_is_none_without_a_driver_or_a_compiler_or_where_gpus_differ(monke
 @pytest.fixture
 def in_memory(monkeypatch, tmp_path):
     """A kernel in memory, and how it is launched."""
-    monkeypatch.setattr(seam, "_HANDLERS", set())
+    monkeypatch.setattr(seam, "_HANDLERS", {})
     monkeypatch.setattr(objects, "folder", lambda: tmp_path)
     filled, registered = [], []
     monkeypatch.setattr(cubin, "fill", lambda slot, *given: filled.append(given))
@@ -244,7 +244,6 @@ def test_a_program_calls_the_handler(in_memory, monkeypatch, tmp_path):
 
 def test_one_can_wait_for_kernels(in_memory, monkeypatch):
     """Whoever measures the time of launches does not measure the compiler's."""
-    monkeypatch.setattr(seam, "_COMPILERS", [])
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
     may_end, ended = threading.Event(), []
 
