@@ -177,10 +177,14 @@ def settings(data: Path) -> str:
         by_task.setdefault(row["task"], []).append(float(row["final_return"]))
     tasks = list(dict.fromkeys(task for by_task in returns_of.values() for task in by_task))
     lines = [
-        [*combination, *(f"{number(fmean(of[x]))} ({number(min(of[x]))})" for x in tasks)]
-        for combination, of in sorted(returns_of.items())
+        [*combination, *(_mean_and_worst(by_task[task]) for task in tasks)]
+        for combination, by_task in sorted(returns_of.items())
     ]
     return table(["`--max-kl`", "`--initial-std`", "`--entropy-cost`", *tasks], lines)
+
+
+def _mean_and_worst(returns: Sequence[float]) -> str:
+    return f"{number(fmean(returns))} ({number(min(returns))})"
 
 
 def agreement(data: Path) -> str:
