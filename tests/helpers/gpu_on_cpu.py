@@ -170,6 +170,7 @@ def lowered(monkeypatch, function, *args, fills=False):
     if not fills:
         monkeypatch.setattr(seam, "_handler", lambda kernel: seam._target(kernel.key))
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
+    monkeypatch.setattr(seam, "_num_processors", lambda: 132)
     monkeypatch.setattr(seam, "_grid", lambda items, most, blocks: (-(-items // 32), 32))
     traced = jax.jit(function).trace(*jax.tree.map(jnp.asarray, args))
     return traced.lower(lowering_platforms=("cuda",)).as_text()

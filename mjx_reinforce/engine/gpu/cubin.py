@@ -37,12 +37,14 @@ class Kernel(NamedTuple):
     text: its entry is "play"
     launch: how it is launched
     compiled: whether it was written now, and not read from disk
+    few: the kernel that plays few items faster, if there is one; see ``team_kernel.for_items``
     """
 
     key: str
     text: str
     launch: Launch
     compiled: bool
+    few: "Kernel | None" = None
 
     @property
     def source(self) -> Source:

@@ -10,10 +10,14 @@ import math
 import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
+from jax.extend import core
+from jax.interpreters import mlir
 
 from mjx_reinforce.engine import objects
 from mjx_reinforce.engine.gpu import cubin, loops, nvrtc
@@ -103,9 +107,14 @@ def compute_capability() -> str:
     return str(getattr(jax.devices()[0], "compute_capability", ""))
 
 
+def _num_processors() -> int:
+    """Returns how many multiprocessors the GPU has."""
+    return jax.devices()[0].core_count
+
+
 def kernel_dependencies() -> str:
     """Returns what a program with kernels depends on."""
-    processors = f"{jax.devices()[0].core_count} multiprocessors"
+    processors = f"{_num_processors()} multiprocessors"
     return f"compute capability {compute_capability()}, {processors}, {nvrtc.version()}"
 
 
@@ -183,7 +192,7 @@ def launch_map(
         sizes = jnp.array([examples], jnp.int32)
         batch_shapes = [jax.ShapeDtypeStruct((examples, *x.shape[1:]), x.dtype) for x in shapes]
         aliases = {}
-        if kernel.launch.lanes == 1 and loops.is_written_over(args, batch_shapes):
+        if sized_kernel.launch.lanes == 1 and loops.is_written_over(args, batch_shapes):
             aliases = {1 + k: k for k in range(len(batch_shapes))}
         return _call(sized_kernel, grid, [sizes, *args], batch_shapes, aliases)
 
@@ -209,21 +218,44 @@ def _call(
       aliases: the numbers of arguments that the kernel writes results over, and of those results.
         XLA copies an argument that is read later, and no other.
     """
+    results = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in shapes)
+    pairs = tuple(aliases.items())
+    return _LAUNCH.bind(*arguments, kernel=kernel, grid=grid, results=results, aliases=pairs)
+
+
+def _ffi_call(*arguments: jax.Array, kernel: Any, grid: Any, results: Any, aliases: Any) -> Any:
+    """Calls the handler of a kernel, which is compiled from here on."""
     scratch = []
     if words := kernel.launch.scratch * math.prod(grid):
         scratch.append(jax.ShapeDtypeStruct((words,), jnp.int32))
     blocks, threads = map(np.int32, grid)
     target = _handler(kernel)
-    call = jax.ffi.ffi_call(target, [*shapes, *scratch], input_output_aliases=dict(aliases))
-    return call(*arguments, blocks=blocks, threads=threads)[: len(shapes)]
+    call = jax.ffi.ffi_call(target, [*results, *scratch], input_output_aliases=dict(aliases))
+    return call(*arguments, blocks=blocks, threads=threads)[: len(results)]
+
+
+@functools.cache
+def _compiled_call(**parameters: Any) -> Callable[..., Any]:
+    """Returns what launches a kernel outside of ``jax.jit``."""
+    return jax.jit(functools.partial(_ffi_call, **parameters))
+
+
+#: A launch. Its kernel is compiled where it is lowered, and not where it is traced: ``vmap`` also
+#: traces the launch for one seed, of another size and so perhaps of another kernel.
+_LAUNCH = core.Primitive("launch")
+_LAUNCH.multiple_results = True
+_LAUNCH.def_abstract_eval(
+    lambda *_, results, **__: [jax.core.ShapedArray(x.shape, x.dtype) for x in results]
+)
+_LAUNCH.def_impl(lambda *arguments, **parameters: _compiled_call(**parameters)(*arguments))
+mlir.register_lowering(_LAUNCH, mlir.lower_fun(_ffi_call, multiple_results=True))
 
 
 def _sized(kernel: cubin.Kernel, count: int) -> tuple[cubin.Kernel, tuple[int, int]]:
     """Returns the kernel, and how many blocks of how many threads, that play so many items."""
-    if kernel.launch.lanes > 1:
-        kernel = team.for_items(kernel, count, jax.devices()[0].core_count, compute_capability())
-    launch = kernel.launch
-    return kernel, _grid(count * launch.lanes, launch.threads, launch.blocks)
+    sized_kernel = team.for_items(kernel, count, _num_processors(), compute_capability())
+    launch = sized_kernel.launch
+    return sized_kernel, _grid(count * launch.lanes, launch.threads, launch.blocks)
 
 
 def _grid(num_items: int, limit: int, blocks: int) -> tuple[int, int]:
@@ -231,7 +263,7 @@ def _grid(num_items: int, limit: int, blocks: int) -> tuple[int, int]:
 
     They are spread over all multiprocessors, each of which has so many blocks at most.
     """
-    processors = jax.devices()[0].core_count
+    processors = _num_processors()
     # A block is whole warps. Few episodes get small blocks, so that each multiprocessor has some.
     threads = min(WARP * -(-num_items // (WARP * processors)), limit)
     return min(-(-num_items // threads), blocks * processors), threads

@@ -199,19 +199,26 @@ def _source(physics: Physics, text: CText, loop: str, words: int) -> Source:
 def for_items(
     kernel: cubin.Kernel, num_items: int, processors: int, capability: str
 ) -> cubin.Kernel:
-    """Returns a kernel whose blocks are of the size that so many items are played fastest with.
+    """Returns the kernel, with blocks of the size, that plays so many items fastest.
 
     Args:
-      kernel: with the blocks for few items.
+      kernel: of threads, or of teams with the blocks for few items.
       num_items: how many it plays.
       processors: the GPU's multiprocessors.
       capability: the GPU's compute capability.
     """
-    # Where a team of the small blocks has one episode at most, more teams would have none.
+    if kernel.few is not None and _has_one_each(kernel.few.launch, num_items, processors):
+        return kernel.few
     launch = kernel.launch
-    is_small = num_items * launch.lanes <= launch.threads * processors
+    # Where a team of the small blocks has one episode at most, more teams would have none.
+    is_small = _has_one_each(launch, num_items, processors)
     if is_small or launch.most_threads in (0, launch.threads):
         return kernel
     source = kernel.source._replace(launch=launch._replace(threads=launch.most_threads))
     name = f"{kernel.key} {launch.most_threads} threads"
     return cubin.load_kernel(name, lambda: source, capability, objects.folder())
+
+
+def _has_one_each(launch: Launch, num_items: int, processors: int) -> bool:
+    """Returns whether a team has one item at most, with a block on each multiprocessor."""
+    return num_items * launch.lanes <= launch.threads * processors

@@ -242,10 +242,13 @@ def load(
         return _by_one_lane(job, env, function, examples, writers, name)
     target = machine.this_machine() if available.platform() == "cpu" else None
     unrolled = SCANS
+    of_teams = None
     if target is None:
-        team_kernel_and_shapes = _by_teams(job, env, function, examples, writers, name)
-        if team_kernel_and_shapes is not None:
-            return team_kernel_and_shapes
+        plays_few = team.play_few(env)
+        if plays_few or team.why_not(env) is None:
+            of_teams = _by_teams(job, env, function, examples, writers, name)
+        if of_teams is not None and not plays_few:
+            return of_teams
         if env is not None and c_mujoco.why_best(env) is not None:
             raise scalar.UnsupportedPrimitive("a thread of a GPU plays it slower than C MuJoCo")
         unrolled = _GPU_SCANS
@@ -270,7 +273,8 @@ def load(
         return _titled(writers.gpu(expansion), name, expansion)
 
     capability = gpu_seam.compute_capability()
-    return cubin.load_kernel(source, write_gpu, capability, objects.folder()), shapes
+    code = cubin.load_kernel(source, write_gpu, capability, objects.folder())
+    return code._replace(few=of_teams and of_teams[0]), shapes
 
 
 def _title(name: str, expansion: scalarized.Scalarized) -> str:
@@ -304,8 +308,6 @@ def _by_teams(
     name: str,
 ) -> tuple[cubin.Kernel, Any] | None:
     """Returns what ``load`` does, for teams of lanes; None if they do not play this."""
-    if team.why_not(env) is not None:
-        return None
     model = team.physics_model(env)
     with base.keeping_whole():
         try:

@@ -1,4 +1,4 @@
-"""Which environments teams of lanes play, and their physics."""
+"""Which environments teams of lanes play, all or only few episodes of them, and their physics."""
 
 import ctypes
 from typing import Any
@@ -16,12 +16,15 @@ _NARROW_DOFS = 8
 #: With more possible contacts, eight lanes play a narrow model faster where its file allows few
 #: iterations: where too many touch for a thread, it searches with the rows of all.
 _CONTACTS_OF_THREAD = 16
+#: With so many possible contacts with friction, or more, sixteen lanes play few episodes of a model
+#: faster than threads do (docs/engine.md).
+_FRICTIONAL_CONTACTS = 10
 #: CUDA's number of the attribute of a GPU: bytes of shared memory that a block may have.
 _SHARED_OF_BLOCK = 97
 
 
 def why_not(env: Any) -> str | None:
-    """Returns in one line why teams do not play an environment; None if they do."""
+    """Returns in one line why teams do not play an environment alone; None if they do."""
     model = physics_model(env)
     if model is None:
         return "it simulates no model of MuJoCo's"
@@ -31,6 +34,24 @@ def why_not(env: Any) -> str | None:
     if can_be_threads and not _is_for_teams(model.mj_model):
         return f"a thread plays a model of fewer than {_LEAST_DOFS} degrees of freedom faster"
     return tables.why(model.mj_model, model.random)
+
+
+def play_few(env: Any) -> bool:
+    """Returns whether teams play few episodes of an environment of which threads play many.
+
+    So many are few that each team has one at most; see ``gpu.team_kernel.for_items``.
+    """
+    model = physics_model(env)
+    if model is None or c_mujoco.why_best(env) is not None or _is_for_teams(model.mj_model):
+        return False
+    from mjx_reinforce.engine.team import contact_kinds, tables
+
+    # A thread searches through the rows of all contacts, which lanes share. It waits for memory
+    # meanwhile, so that few threads leave most of a GPU idle. Without a search it is faster.
+    searches = model.mj_model.opt.iterations > 1
+    num_contacts = contact_kinds.num_frictional(model.mj_model)
+    is_slow = searches and num_contacts >= _FRICTIONAL_CONTACTS
+    return is_slow and tables.why(model.mj_model, model.random) is None
 
 
 def _is_for_teams(model: MjModel) -> bool:
@@ -51,6 +72,8 @@ def played_by(env: Any) -> str:
     """Returns what plays an episode of an environment on a GPU, for people."""
     model = physics_model(env)
     reason = why_not(env)
+    if model is not None and play_few(env):
+        return f"{_lanes(model)} lanes an episode, or a thread where there are many"
     if model is None or reason:
         return f"a thread an episode ({reason})"
     return f"{_lanes(model)} lanes an episode"

@@ -7,7 +7,13 @@ import numpy as np
 
 from mjx_reinforce.engine.team import flags
 from mjx_reinforce.engine.team.records import Softness
-from mjx_reinforce.engine.team.supported import CONVEX_CONTACTS, GeomPair, geom_kinds
+from mjx_reinforce.engine.team.supported import (
+    CONVEX_CONTACTS,
+    NUM_PARTS,
+    GeomPair,
+    geom_kinds,
+    meeting,
+)
 
 #: MuJoCo's mjMINVAL, mjMINMU, mjMINIMP and mjMAXIMP.
 MIN_VALUE = 1e-15
@@ -132,3 +138,9 @@ def mix_of(model: Any, pair: GeomPair) -> Mix:
 def _friction(coefficients: np.ndarray) -> tuple[float, ...]:
     """Returns the friction of a contact; less than MuJoCo's mjMINMU is mjMINMU."""
     return tuple(map(float, np.maximum(coefficients, _MIN_FRICTION)))
+
+
+def num_frictional(model: Any) -> int:
+    """Returns how many contacts with friction a model may have at once."""
+    pairs = [pair for pair in meeting(model) if contact_kind(model, pair).dim > 1]
+    return sum(NUM_PARTS.get(geom_kinds(model, pair), 1) for pair in pairs)

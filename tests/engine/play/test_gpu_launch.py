@@ -259,6 +259,16 @@ def test_one_can_wait_for_kernels(in_memory, monkeypatch):
     assert ended
 
 
+def test_few_items_are_for_lanes_as_long_as_each_team_has_one_at_most(monkeypatch):
+    monkeypatch.setattr(seam, "_num_processors", lambda: 132)
+    monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
+    few = KERNEL._replace(key="1" * 64, launch=Launch(threads=512, blocks=1, lanes=16))
+    kernel = KERNEL._replace(few=few)
+    assert seam._sized(kernel, 4_224) == (few, (132, 512))
+    assert seam._sized(kernel, 4_225) == (kernel, (133, 32))
+    assert seam._sized(KERNEL, 4_224) == (KERNEL, (132, 32))
+
+
 def test_an_exported_program_finds_its_kernel_again(in_memory, monkeypatch, tmp_path):
     filled, registered = in_memory
     monkeypatch.setattr(seam, "_why_not_compiled", lambda: None)

@@ -77,21 +77,36 @@ def chain(num_dofs, capsules, iterations):
     return types.SimpleNamespace(physics_model=lambda: base.PhysicsModel(model, 1, "chain"))
 
 
+#: What is said of models whose episodes a thread plays where there are many, and of small ones.
+FEW = ", or a thread where there are many"
+FEW_DOFS = "a thread plays a model of fewer than 14 degrees of freedom faster"
+
+
 @pytest.mark.parametrize(
     ("num_dofs", "capsules", "iterations", "player"),
     [
-        (7, 9, 4, "8 lanes"),
-        (7, 8, 4, "a thread"),
-        (7, 9, 100, "a thread"),
-        (9, 9, 4, "a thread"),
-        (14, 1, 100, "16 lanes"),
-        (16, 1, 4, "32 lanes"),
+        (7, 9, 4, "8 lanes an episode"),
+        (7, 9, 1, "8 lanes an episode"),
+        (7, 8, 4, f"16 lanes an episode{FEW}"),
+        (7, 9, 100, f"16 lanes an episode{FEW}"),
+        (9, 5, 4, f"16 lanes an episode{FEW}"),
+        (9, 4, 4, f"a thread an episode ({FEW_DOFS})"),
+        (9, 9, 1, f"a thread an episode ({FEW_DOFS})"),
+        (14, 1, 100, "16 lanes an episode"),
+        (16, 1, 4, "32 lanes an episode"),
     ],
 )
 def test_what_plays_a_model(num_dofs, capsules, iterations, player):
     """Eight lanes, where few iterations are allowed and many contacts are possible."""
     env = chain(num_dofs, capsules, iterations)
-    assert teams.played_by(env).startswith(f"{player} an episode")
+    assert teams.played_by(env) == player
+    assert teams.play_few(env) == player.endswith(FEW)
+
+
+def test_contacts_without_friction_do_not_slow_a_thread():
+    env = chain(9, 9, 4)
+    env.physics_model().mj_model.geom_condim[:] = 1
+    assert not teams.play_few(env)
 
 
 def test_an_environment_need_not_offer_a_model():

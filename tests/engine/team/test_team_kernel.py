@@ -2,6 +2,7 @@
 
 import itertools
 import re
+from functools import partial
 
 import gpu_on_cpu
 import jax
@@ -13,7 +14,7 @@ from players import actor_and_act, only_active, played
 from robot import Robot
 
 from mjx_reinforce import envs, make_vec
-from mjx_reinforce.engine.gpu import cubin, team_kernel
+from mjx_reinforce.engine.gpu import cubin, seam, team_kernel
 from mjx_reinforce.engine.play import available, choice, native, program
 from mjx_reinforce.engine.play import teams as team
 from mjx_reinforce.engine.scalar import scalarized
@@ -260,8 +261,8 @@ def test_teams_play_a_task_of_all_parts(teams):
     assert len(np.unique(commands[commands != 0])) > 3
 
 
-def kernels(monkeypatch, env):
-    """Returns the texts of the kernels that play an environment, which are not compiled."""
+def kernels_are_written(monkeypatch):
+    """Lets kernels be written, and not compiled; returns the list that their texts come into."""
     texts = []
 
     def load(key, write, capability, folder):
@@ -270,9 +271,15 @@ def kernels(monkeypatch, env):
         return cubin.Kernel(key, source.text, source.launch, compiled=True)
 
     gpu_on_cpu.emulate(monkeypatch)
-    monkeypatch.setattr(team, "_LEAST_DOFS", 1)
     monkeypatch.setattr(team, "_shared_memory", lambda: 232_448)
     monkeypatch.setattr(cubin, "load_kernel", load)
+    return texts
+
+
+def kernels(monkeypatch, env):
+    """Returns the texts of the kernels of teams that play an environment."""
+    texts = kernels_are_written(monkeypatch)
+    monkeypatch.setattr(team, "_LEAST_DOFS", 1)
     actor, act, distribution = actor_and_act(env, (5,))
 
     def play(actor, key):
@@ -289,6 +296,29 @@ def test_what_an_episode_draws_of_its_model_is_drawn_where_it_begins(monkeypatch
     begin, step = text.split("t.meet(running)")
     assert begin.count("\ndraw(M, s, ") == 1
     assert "draw(M, s, " not in step
+
+
+def test_lanes_play_few_episodes_and_threads_many(monkeypatch):
+    """All seeds' episodes count, as one launch plays them; no kernel but theirs is compiled."""
+    lanes, sized, call = [], seam._sized, seam._call
+    kernels_are_written(monkeypatch)
+    monkeypatch.setattr(team, "_FRICTIONAL_CONTACTS", 1)
+    monkeypatch.setattr(seam, "_sized", sized)
+    monkeypatch.setattr(seam, "_call", call)
+    monkeypatch.setattr(seam, "_handler", lambda kernel: lanes.append(kernel.launch.lanes) or "it")
+    env = leg(Leg, 40)
+    actor, act, distribution = actor_and_act(env, ())
+
+    def play(num_episodes, key):
+        options = {"num_episodes": num_episodes, "horizon": 20}
+        return native.native_rollout(env, act, actor, distribution, key, **options)
+
+    keys = jax.random.split(jax.random.key(0))
+    for num_episodes in (2_112, 2_113):
+        function = jax.vmap(partial(play, num_episodes))
+        text = gpu_on_cpu.lowered(monkeypatch, function, keys, fills=True)
+        assert text.count("custom_call @it(") == 1
+    assert lanes == [16, 1]
 
 
 def cylinders(task):
