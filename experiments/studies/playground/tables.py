@@ -1,6 +1,7 @@
 """The tables of docs/playground.md: returns after minutes of training beside published ones."""
 
 import itertools
+import statistics
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import fmean
@@ -92,25 +93,33 @@ def returns(data: Path) -> str:
         ]
         for result in measured
     ]
-    for minutes in sorted({result.minutes for result in measured}):
-        common = [
-            result
-            for result in measured
-            if result.minutes == minutes
-            and all(result.task in column for column in published.values())
-        ]
-        if not common:
-            continue
-        mean = float(np.mean([result.returns.mean() for result in common]))
+    if measured:
+        lines += _means(measured, published)
+    return table([*header, *published], lines)
+
+
+def _means(measured: Sequence[Result], published: dict[str, dict[str, float]]) -> list[list[str]]:
+    """Returns the lines of means over the tasks of the budget that most have.
+
+    The first is over all of them, and beside it the columns that have all; the other one is over
+    those that all columns have.
+    """
+    minutes = statistics.mode(result.minutes for result in measured)
+    all_tasks = [result for result in measured if result.minutes == minutes]
+    common = [x for x in all_tasks if all(x.task in column for column in published.values())]
+    groups = {f"mean of the {len(all_tasks)} tasks": all_tasks}
+    groups[f"mean of the {len(common)} tasks that all have"] = common
+    lines = []
+    for label, group in groups.items():
+        mean = fmean(float(result.returns.mean()) for result in group) if group else None
         means = [
-            float(np.mean([column[result.task] for result in common]))
+            fmean(column[result.task] for result in group)
+            if group and all(result.task in column for result in group)
+            else None
             for column in published.values()
         ]
-        label = f"mean of the {len(common)} tasks that all have"
-        lines.append(
-            [label, "", f"{minutes:g}", number(mean), "", "", "", *(fixed(x, 0) for x in means)]
-        )
-    return table([*header, *published], lines)
+        lines.append([label, "", f"{minutes:g}", _cell(mean), "", "", "", *map(_cell, means)])
+    return lines
 
 
 def after_a_minute(data: Path) -> str:
