@@ -4,8 +4,9 @@
     python -m experiments.speed.lanes page    # the table of docs/engine.md, from lanes.csv
 
 One lane is a thread an episode. Each number of lanes plays all numbers of episodes, with a policy
-of 64-64 units that has learned nothing; the best of five rollouts counts. Rows are added to
-``lanes.csv`` beside this file.
+of 64-64 units that has learned nothing; the best of five rollouts counts. An env step counts also
+after its episode has ended, so that speeds of tasks whose episodes end early are too high, and
+their ratios are not. Rows are added to ``lanes.csv`` beside this file.
 """
 
 import argparse
@@ -31,6 +32,8 @@ DATA = Path(__file__).with_suffix(".csv")
 STEPS = 50
 #: Rollouts that are timed, of each number of episodes.
 REPEATS = 5
+#: Numbers of episodes.
+SIZES = (256, 1024, 2048, 4096, 8192, 16384)
 COLUMNS: tuple[str, ...] = (
     *("date", "commit", "device", "jax", "task", "lanes", "episodes", "env_steps_per_second"),
 )
@@ -44,7 +47,7 @@ def measure(task: str, lanes: int, batches: Iterable[int]) -> list[dict[str, Any
       lanes: that play an episode.
       batches: numbers of episodes.
     """
-    # What plays is decided by the model, and not by the user; here it is set by hand.
+    # The model and the number of episodes decide what plays; here it is set by hand.
     private: Any = teams
     private._is_for_teams = lambda model: lanes > 1
     private._lanes = lambda model: lanes
@@ -88,13 +91,17 @@ def speeds(data: Path) -> str:
         (row["task"], int(row["lanes"]), int(row["episodes"])): float(row["env_steps_per_second"])
         for row in lines
     }
-    sizes = sorted({size for _, _, size in speed})
-    cells = []
-    for task, lanes in sorted({(task, lanes) for task, lanes, _ in speed if lanes > 1}):
-        if (task, 1, sizes[0]) not in speed:
-            continue  # threads were not timed
-        ratios = [speed[task, lanes, size] / speed[task, 1, size] for size in sizes]
-        cells.append([task.removeprefix("playground:"), str(lanes), *(fixed(x, 2) for x in ratios)])
+    ratios = {
+        (task, lanes, size): fixed(speed[task, lanes, size] / speed[task, 1, size], 2)
+        for task, lanes, size in speed
+        if lanes > 1 and (task, 1, size) in speed
+    }
+    sizes = sorted({size for _, _, size in ratios})
+    cells = [
+        [task.removeprefix("playground:"), str(lanes)]
+        + [ratios.get((task, lanes, size), "") for size in sizes]
+        for task, lanes in sorted({(task, lanes) for task, lanes, _ in ratios})
+    ]
     header = ["task", "lanes", *(f"{size:,} episodes" for size in sizes)]
     return table(header, cells)
 
@@ -111,7 +118,7 @@ def main() -> None:
     stage = stages.add_parser("measure", help="time a task on this GPU")
     stage.add_argument("task")
     stage.add_argument("--lanes", type=int, nargs="+", default=[1, 16], help="1, 8, 16 or 32")
-    stage.add_argument("--episodes", type=int, nargs="+", default=[256, 1024, 2048, 4096, 8192])
+    stage.add_argument("--episodes", type=int, nargs="+", default=SIZES)
     settings = parser.parse_args()
     if settings.stage == "page":
         page = DOCS / "engine.md"

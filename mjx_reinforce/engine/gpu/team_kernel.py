@@ -199,7 +199,7 @@ def _source(physics: Physics, text: CText, loop: str, words: int) -> Source:
 def for_items(
     kernel: cubin.Kernel, num_items: int, processors: int, capability: str
 ) -> cubin.Kernel:
-    """Returns the kernel, with blocks of the size, that plays so many items fastest.
+    """Returns the kernel, and the size of its blocks, that play so many items fastest.
 
     Args:
       kernel: of threads, or of teams with the blocks for few items.

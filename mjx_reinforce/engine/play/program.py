@@ -330,7 +330,7 @@ def _by_teams(
             capability = gpu_seam.compute_capability()
             return cubin.load_kernel(f"{job} {source}", write, capability, objects.folder()), shapes
         except (scalar.UnsupportedPrimitive, scalar.TooLarge, NotImplementedError) as error:
-            warnings.warn(f"a thread plays an episode, slower than lanes: {error}", stacklevel=2)
+            warnings.warn(f"a thread plays each episode, as lanes cannot: {error}", stacklevel=2)
             return None
 
 

@@ -46,8 +46,8 @@ def play_few(env: Any) -> bool:
         return False
     from mjx_reinforce.engine.team import contact_kinds, tables
 
-    # A thread searches through the rows of all contacts, which lanes share. It waits for memory
-    # meanwhile, so that few threads leave most of a GPU idle. Without a search it is faster.
+    # A thread searches alone through the rows of all contacts, which lanes share, and few threads
+    # leave most of a GPU idle. With one iteration, there is no search.
     searches = model.mj_model.opt.iterations > 1
     num_contacts = contact_kinds.num_frictional(model.mj_model)
     is_slow = searches and num_contacts >= _FRICTIONAL_CONTACTS

@@ -142,5 +142,7 @@ def _friction(coefficients: np.ndarray) -> tuple[float, ...]:
 
 def num_frictional(model: Any) -> int:
     """Returns how many contacts with friction a model may have at once."""
-    pairs = [pair for pair in meeting(model) if contact_kind(model, pair).dim > 1]
-    return sum(NUM_PARTS.get(geom_kinds(model, pair), 1) for pair in pairs)
+    kinds = [
+        geom_kinds(model, pair) for pair in meeting(model) if contact_kind(model, pair).dim > 1
+    ]
+    return sum(CONVEX_CONTACTS.get(kind) or NUM_PARTS.get(kind, 1) for kind in kinds)
