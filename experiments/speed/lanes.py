@@ -117,7 +117,7 @@ def main() -> None:
     stages.add_parser("page", help="write the table again")
     stage = stages.add_parser("measure", help="time a task on this GPU")
     stage.add_argument("task")
-    stage.add_argument("--lanes", type=int, nargs="+", default=[1, 16], help="1, 8, 16 or 32")
+    stage.add_argument("--lanes", type=int, nargs="+", default=[1, 16], choices=(1, 8, 16, 32))
     stage.add_argument("--episodes", type=int, nargs="+", default=SIZES)
     settings = parser.parse_args()
     if settings.stage == "page":

@@ -35,6 +35,18 @@ def test_lanes_stand_beside_threads(tmp_path):
     ]
 
 
+@pytest.mark.slow
+@pytest.mark.cpu
+def test_a_row_is_measured_for_each_number_of_episodes(monkeypatch, tmp_path):
+    """On a CPU, whose lanes are not those that are asked for."""
+    for name in ("_is_for_teams", "_lanes", "play_few"):
+        monkeypatch.setattr(lanes.teams, name, getattr(lanes.teams, name))  # it is put back after
+    lines = lanes.measure("InvertedPendulum-v5", 1, (2, 3))
+    assert [(row["lanes"], row["episodes"]) for row in lines] == [(1, 2), (1, 3)]
+    assert all(float(row["env_steps_per_second"]) > 0 for row in lines)
+    rows.append(tmp_path / "lanes.csv", lines, lanes.COLUMNS)
+
+
 @pytest.mark.cpu
 def test_without_a_gpu_there_is_nothing_to_measure(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["lanes", "measure", "Walker2d-v5"])

@@ -242,13 +242,13 @@ def load(
         return _by_one_lane(job, env, function, examples, writers, name)
     target = machine.this_machine() if available.platform() == "cpu" else None
     unrolled = SCANS
-    of_teams = None
+    few = None
     if target is None:
         plays_few = team.play_few(env)
         if plays_few or team.why_not(env) is None:
-            of_teams = _by_teams(job, env, function, examples, writers, name)
-        if of_teams is not None and not plays_few:
-            return of_teams
+            few, team_shapes = _by_teams(job, env, function, examples, writers, name)
+            if few is not None and not plays_few:
+                return few, team_shapes
         if env is not None and c_mujoco.why_best(env) is not None:
             raise scalar.UnsupportedPrimitive("a thread of a GPU plays it slower than C MuJoCo")
         unrolled = _GPU_SCANS
@@ -274,7 +274,7 @@ def load(
 
     capability = gpu_seam.compute_capability()
     code = cubin.load_kernel(source, write_gpu, capability, objects.folder())
-    return code._replace(few=of_teams and of_teams[0]), shapes
+    return code._replace(few=few), shapes
 
 
 def _title(name: str, expansion: scalarized.Scalarized) -> str:
@@ -306,8 +306,8 @@ def _by_teams(
     examples: Sequence[PyTree],
     writers: Writers,
     name: str,
-) -> tuple[cubin.Kernel, Any] | None:
-    """Returns what ``load`` does, for teams of lanes; None if they do not play this."""
+) -> tuple[cubin.Kernel | None, Any]:
+    """Returns what ``load`` does, for teams of lanes; no kernel if they do not play this."""
     model = team.physics_model(env)
     with base.keeping_whole():
         try:
@@ -317,9 +317,9 @@ def _by_teams(
             # simulates none, unless only the device code has this environment's physics.
             simulated = {*scalar.simulated_models(program)}
             if model is None or not simulated <= {model.digest}:
-                return None
+                return None, None
             if not simulated and c_mujoco.why_best(env) is None:
-                return None
+                return None, None
             physics = team.team_physics(model)
             source = f"{jaxprs.fingerprint(program)} {physics} {objects.source_digest(*_WRITERS)}"
 
@@ -331,7 +331,7 @@ def _by_teams(
             return cubin.load_kernel(f"{job} {source}", write, capability, objects.folder()), shapes
         except (scalar.UnsupportedPrimitive, scalar.TooLarge, NotImplementedError) as error:
             warnings.warn(f"a thread plays each episode, as lanes cannot: {error}", stacklevel=2)
-            return None
+            return None, None
 
 
 def _by_one_lane(

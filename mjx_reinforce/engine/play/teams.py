@@ -49,8 +49,7 @@ def play_few(env: Any) -> bool:
     # A thread searches alone through the rows of all contacts, which lanes share, and few threads
     # leave most of a GPU idle. With one iteration, there is no search.
     searches = model.mj_model.opt.iterations > 1
-    num_contacts = contact_kinds.num_frictional(model.mj_model)
-    is_slow = searches and num_contacts >= _FRICTIONAL_CONTACTS
+    is_slow = searches and contact_kinds.num_frictional(model.mj_model) >= _FRICTIONAL_CONTACTS
     return is_slow and tables.why(model.mj_model, model.random) is None
 
 

@@ -242,6 +242,18 @@ def test_a_program_calls_the_handler(in_memory, monkeypatch, tmp_path):
     assert filled == [(KERNEL, "9.0", tmp_path)]
 
 
+def test_a_launch_outside_of_jit_is_compiled_once(driver, compiler, monkeypatch):
+    """The result is written over the second argument, and the kernel adds the first to it."""
+    cubin.fill(handler_of_a_cpu("outside_of_jit"), KERNEL, "9.0", None)
+    targets = []
+    monkeypatch.setattr(seam, "_handler", lambda _: targets.append("outside_of_jit") or targets[0])
+    seam._compiled_call.cache_clear()
+    x = jnp.array([7], jnp.int32)
+    assert [int(launch(x)[0]) for _ in range(3)] == [14] * 3
+    assert len(targets) == 1
+    assert driver.launches == [(1, (3, 1, 1, 64, 1, 1))] * 3
+
+
 def test_one_can_wait_for_kernels(in_memory, monkeypatch):
     """Whoever measures the time of launches does not measure the compiler's."""
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")

@@ -10,6 +10,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.engine import base, scalar
 from mjx_reinforce.engine.play import teams
 from mjx_reinforce.engine.scalar import jaxprs, scalarized
+from mjx_reinforce.engine.team import contact_kinds
 from mjx_reinforce.envs.tasks.ant import Ant
 
 
@@ -101,6 +102,18 @@ def test_what_plays_a_model(num_dofs, capsules, iterations, player):
     env = chain(num_dofs, capsules, iterations)
     assert teams.played_by(env) == player
     assert teams.play_few(env) == player.endswith(FEW)
+
+
+def test_a_pair_of_the_convex_collider_has_all_its_contacts():
+    """A cylinder may meet a box in four places."""
+    xml = """
+    <mujoco><worldbody><geom type="box" size="1 1 .1"/>
+      <body pos="0 0 1">
+        <joint type="slide" axis="0 0 1"/><geom type="cylinder" size=".1 .1"/>
+      </body>
+    </worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)  # pyright: ignore[reportAttributeAccessIssue]
+    assert contact_kinds.num_frictional(model) == 4
 
 
 def test_contacts_without_friction_do_not_slow_a_thread():
