@@ -27,7 +27,14 @@ from mjx_reinforce.learning.diagnostics import Metrics
 from mjx_reinforce.learning.distributions import default_distribution
 from mjx_reinforce.learning.estimators import Estimator, leave_one_out, standardize
 from mjx_reinforce.learning.policy import Actor, Policy, act, mlp_policy, within_bounds
-from mjx_reinforce.learning.updates import Clock, Problem, Update, full_batch, make_optimizer
+from mjx_reinforce.learning.updates import (
+    Clock,
+    Problem,
+    Update,
+    full_batch,
+    in_groups,
+    make_optimizer,
+)
 
 
 class TrainState(struct.PyTreeNode, kw_only=True):
@@ -408,7 +415,7 @@ class _Reinforce:
         def surrogate(params, samples):
             """Returns minus the sum [] over samples, and the sum of their entropies H."""
             observation, action, weight, mask = samples
-            outputs = self.policy.apply(params, observation)
+            outputs = in_groups(self.policy.apply)(params, observation)
             entropy = distribution.entropy(outputs)
             # No gradient flows into the weight, which is data here. Minus, as optimizers descend.
             terms = distribution.log_prob(outputs, action) * weight + self.entropy_cost * entropy

@@ -18,7 +18,13 @@ from jax.flatten_util import ravel_pytree
 
 from mjx_reinforce.engine.checks import check_count, check_kind, check_number
 from mjx_reinforce.learning.policy import Policy
-from mjx_reinforce.learning.updates import Problem, Update, draw_steps, whole_rollout
+from mjx_reinforce.learning.updates import (
+    Problem,
+    Update,
+    draw_steps,
+    in_groups,
+    whole_rollout,
+)
 
 #: Conjugate gradients know F from so many of the visited steps at most.
 MAX_FISHER_STEPS = 4096
@@ -121,7 +127,7 @@ def _by_conjugate_gradients(
             step_weight = mask.reshape(-1) / jnp.maximum(jnp.sum(mask), 1)
 
         def outputs(params):
-            return policy.apply(params, observation)
+            return in_groups(policy.apply)(params, observation)
 
         # J v and J^T u at the old parameters: the network is linearized once, not in each product.
         old_outputs, jacobian_product = jax.linearize(outputs, params)

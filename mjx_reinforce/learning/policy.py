@@ -18,9 +18,6 @@ from mjx_reinforce.learning.distributions import Distribution
 #: The ways to draw initial weights.
 INITIALIZERS = ("orthogonal", "torch")
 
-# With TF32, the default on NVIDIA's GPUs, small policies fail to learn and nothing reports it.
-_PRECISION = jax.lax.Precision.HIGHEST
-
 
 class MLP(nn.Module):
     """A multilayer perceptron with tanh units and a linear last layer.
@@ -34,12 +31,15 @@ class MLP(nn.Module):
       weights in the hidden layers, zero biases; "torch": all weights and biases
       uniform within 1 / sqrt(fan-in), as in ``torch.nn.Linear``, and ``output_scale``
       is not used
+    precision: of products. ``DEFAULT`` is TF32 on NVIDIA's GPUs: with it, small policies fail to
+      learn and nothing reports it
     """
 
     hidden_sizes: Sequence[int]
     num_outputs: int
     output_scale: float = 1.0
     initializer: str = "orthogonal"
+    precision: jax.lax.Precision = jax.lax.Precision.HIGHEST
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
@@ -58,7 +58,8 @@ class MLP(nn.Module):
         # PyTorch draws biases from the same range as weights, by the layer's inputs.
         if self.initializer == "torch":
             kernel_init = bias_init = _symmetric_uniform(x.shape[-1] ** -0.5)
-        return nn.Dense(size, kernel_init=kernel_init, bias_init=bias_init, precision=_PRECISION)(x)
+        options = {"kernel_init": kernel_init, "bias_init": bias_init, "precision": self.precision}
+        return nn.Dense(size, **options)(x)
 
 
 def _symmetric_uniform(bound: float) -> nn.initializers.Initializer:

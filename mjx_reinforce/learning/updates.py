@@ -5,6 +5,7 @@ natural gradient is in ``natural_gradient``; ``published.variants`` has updates 
 """
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -23,6 +24,10 @@ MAX_SAMPLES = 2**18
 GPU_FACTOR = 4
 #: Steps a chunk covers at most, so that short episodes cost little.
 MAX_STEPS = 128
+#: On a GPU, a network's gradient is summed over so many groups of samples at most ...
+_MAX_GROUPS = 32
+#: ... with so many samples each, or more.
+_MIN_GROUP = 256
 
 
 class Clock(NamedTuple):
@@ -265,6 +270,39 @@ def accumulate(chunk_function: Callable[[Any], Any], sample_arrays: tuple[Any, .
 
     zero_sums = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     return while_any(while_needed(has_steps), body, (jnp.zeros((), jnp.int32), zero_sums))[1]
+
+
+def in_groups(apply: Callable[[Any, jax.Array], jax.Array]) -> Callable[..., jax.Array]:
+    """Returns ``apply`` with a gradient that a GPU sums in groups of samples, and then over them.
+
+    The gradient of a layer's weights is a product of matrices with few entries, each of them a sum
+    over all samples. cuBLAS gives an entry's sum to one multiprocessor, so that most of them wait.
+
+    Args:
+      apply: (params, inputs [..., O]) -> outputs [..., K] or [...], of each sample by itself.
+    """
+
+    def apply_in_groups(params: Any, inputs: jax.Array) -> jax.Array:
+        """Returns the outputs of copies of the parameters, one for each group."""
+        *sample_axes, num_inputs = inputs.shape
+        num_groups = _num_groups(math.prod(sample_axes))
+        if num_groups == 1:
+            return apply(params, inputs)
+        # The gradient in a copy is the group's sum. Behind the barrier, XLA does not know that they
+        # are copies, and joins no sums.
+        copies = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_groups, *x.shape)), params)
+        groups = inputs.reshape(num_groups, -1, num_inputs)
+        outputs = jax.vmap(apply)(lax.optimization_barrier(copies), groups)
+        return outputs.reshape(*sample_axes, *outputs.shape[2:])
+
+    return apply_in_groups
+
+
+def _num_groups(num_samples: int) -> int:
+    """Returns in how many groups the gradient of so many samples is summed."""
+    if jax.default_backend() == "cpu":
+        return 1
+    return largest_divisor(num_samples, max(1, min(_MAX_GROUPS, num_samples // _MIN_GROUP)))
 
 
 def draw_steps(key: jax.Array, mask: jax.Array, shape: tuple[int, ...]) -> jax.Array:

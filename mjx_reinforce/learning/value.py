@@ -4,7 +4,7 @@ The network is fitted after its values were used, so that no weight depends on i
 through it, and the gradient stays unbiased (Sutton and Barto 2018, section 13.4).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -22,11 +22,21 @@ from mjx_reinforce.learning.updates import (
     chunk_at,
     draw_steps,
     in_chunks,
+    in_groups,
     while_needed,
 )
 
 #: The share that an update has in the running mean and variance of the returns.
 _UPDATE_SHARE = 0.1
+
+
+def value_network(hidden_sizes: Sequence[int] = (64, 64)) -> nn.Module:
+    """Returns a network of tanh units for ``value_baseline``, whose products a GPU may round.
+
+    A product's factors are TF32 on NVIDIA's GPUs, with 11 bits, and twice as fast. Any function of
+    the observation and the time leaves the gradient unbiased, a rounded one, too.
+    """
+    return MLP(tuple(hidden_sizes), 1, precision=lax.Precision.DEFAULT)
 
 
 class Critic(NamedTuple):
@@ -84,11 +94,11 @@ def value_baseline(
     """
     for name, count in (("horizon", horizon), ("num_fits", num_fits), ("batch_size", batch_size)):
         check_count(name, count)
-    returns_to_go, network, fitter = _defaults(discount, network, optimizer)
+    network = network or value_network()
+    returns_to_go = reward_to_go(discount)
+    fitter = optimizer or optax.adam(3e-3)
 
-    def value(params, observation, step_index):
-        time_share = jnp.asarray(step_index, observation.dtype) / horizon
-        inputs = jnp.concatenate([observation, time_share[..., None]], axis=-1)
+    def value(params, inputs):
         return jnp.asarray(network.apply(params, inputs))[..., 0]
 
     def init(key, observation_size):
@@ -107,7 +117,10 @@ def value_baseline(
         # V of every step, before the fit: the weight must not depend on its own episode through V.
         step_index = jnp.broadcast_to(jnp.arange(len(mask))[:, None], mask.shape)
         step_arrays = (trajectory.observation, step_index, mask)
-        scaled_values = _map_steps(lambda chunk: value(critic.params, *chunk[:2]), step_arrays)
+        scaled_values = _map_steps(
+            lambda chunk: value(critic.params, _with_time(chunk[0], chunk[1], horizon)),
+            step_arrays,
+        )
         values = critic.mean + jnp.sqrt(critic.variance) * scaled_values
         weight, metrics = _residual(returns, values, mask)
 
@@ -120,8 +133,8 @@ def value_baseline(
         targets = (returns.reshape(-1) - mean) / return_unit
 
         def squared_error(params, index):
-            predicted_value = value(params, observations[index], index // num_episodes)
-            return jnp.mean((predicted_value - targets[index]) ** 2)
+            inputs = _with_time(observations[index], index // num_episodes, horizon)
+            return jnp.mean((in_groups(value)(params, inputs) - targets[index]) ** 2)
 
         indices = draw_steps(draw_key, mask, (num_fits, batch_size))
         params, opt_state = _fit(
@@ -167,14 +180,17 @@ def full_batch_value_baseline(
       Estimator(of 1 episodes or more)
     """
     check_count("num_fits", num_fits)
-    returns_to_go, network, fitter = _defaults(discount, network, optimizer)
+    network = network or MLP((64, 64), 1)
+    returns_to_go = reward_to_go(discount)
+    fitter = optimizer or optax.adam(3e-3)
 
     def value(params, observation):
         return jnp.asarray(network.apply(params, observation))[..., 0]
 
     def squared_error(params, chunk):
         observation, returns, mask = chunk
-        return jnp.sum(jnp.where(mask, (value(params, observation) - returns) ** 2, 0.0)), {}
+        errors = in_groups(value)(params, observation) - returns
+        return jnp.sum(jnp.where(mask, errors**2, 0.0)), {}
 
     def init(key, observation_size):
         params = _first_params(network, key, observation_size)
@@ -202,17 +218,10 @@ def full_batch_value_baseline(
     return Estimator(init, update)
 
 
-def _defaults(
-    discount: float | jax.Array,
-    network: nn.Module | None,
-    optimizer: optax.GradientTransformation | None,
-) -> tuple[Estimator, nn.Module, optax.GradientTransformation]:
-    """Returns what gives the returns to go, the network, and the optimizer."""
-    if network is None:
-        network = MLP((64, 64), 1)
-    if optimizer is None:
-        optimizer = optax.adam(3e-3)
-    return reward_to_go(discount), network, optimizer
+def _with_time(observation: jax.Array, step_index: jax.Array, horizon: int) -> jax.Array:
+    """Returns observations [..., O + 1], the share of the time [...] behind their entries."""
+    time_share = jnp.asarray(step_index, observation.dtype) / horizon
+    return jnp.concatenate([observation, time_share[..., None]], axis=-1)
 
 
 def _first_params(network: nn.Module, key: jax.Array, inputs: int) -> Any:

@@ -17,9 +17,9 @@ from mjx_reinforce.learning.distributions import default_std
 from mjx_reinforce.learning.estimators import Estimator
 from mjx_reinforce.learning.learner import Learner, reinforce
 from mjx_reinforce.learning.natural_gradient import natural_gradient
-from mjx_reinforce.learning.policy import MLP, Policy
+from mjx_reinforce.learning.policy import Policy
 from mjx_reinforce.learning.updates import Update, full_batch, make_optimizer
-from mjx_reinforce.learning.value import value_baseline
+from mjx_reinforce.learning.value import value_baseline, value_network
 from mjx_reinforce.registry import (
     ALGORITHMS,
     ESTIMATORS,
@@ -185,7 +185,7 @@ def _build_value_baseline(config: Config, horizon: int) -> Estimator:
     return value_baseline(
         config.discount,
         horizon=horizon,
-        network=MLP(config.value_hidden_sizes, 1),
+        network=value_network(config.value_hidden_sizes),
         optimizer=optax.adam(config.value_learning_rate),
         num_fits=config.value_fits,
         batch_size=config.value_batch_size,

@@ -1,11 +1,15 @@
 """Gradients summed in chunks of time: the same sum, bounded memory, nothing after the end."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce.learning.updates import accumulate_gradient
+from mjx_reinforce.learning.policy import MLP
+from mjx_reinforce.learning.updates import accumulate_gradient, in_groups
+from mjx_reinforce.learning.value import value_network
 
 
 def loss(params, chunk):
@@ -94,3 +98,59 @@ def test_seeds_side_by_side_stop_each_at_its_own_end():
         jax.tree.map(
             lambda a, b, s=s: np.testing.assert_allclose(a[s], b, rtol=1e-5), together, alone
         )
+
+
+@pytest.mark.parametrize("shape", [(125, 8, 3), (2048, 3), (6, 128, 3)])
+def test_a_gpu_sums_gradients_in_groups_and_has_the_same_derivatives(monkeypatch, shape):
+    network = MLP((8,), 2)
+    params = network.init(jax.random.key(0), jnp.zeros(3))
+    inputs = jax.random.normal(jax.random.key(1), shape)
+    weight = jax.random.normal(jax.random.key(2), (*shape[:-1], 2))
+    tangent = jax.tree.map(jnp.ones_like, params)
+
+    def derivatives(apply):
+        outputs, push = jax.linearize(lambda params: apply(params, inputs), params)
+        return outputs, push(tangent), jax.linear_transpose(push, params)(weight)[0]
+
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    grouped = derivatives(in_groups(network.apply))
+    for expected, value in zip(
+        jax.tree.leaves(derivatives(network.apply)), jax.tree.leaves(grouped), strict=True
+    ):
+        np.testing.assert_allclose(value, expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("backend", "shape", "num_groups"),
+    [
+        ("cpu", (2048, 3), 1),
+        ("gpu", (511, 3), 1),  # less than two groups of 256 samples
+        ("gpu", (2048, 3), 8),
+        ("gpu", (127, 256, 3), 32),  # the most
+        ("gpu", (125, 25, 3), 5),  # the largest divisor of 3,125 that is at most 12
+    ],
+)
+def test_a_group_has_enough_samples(monkeypatch, backend, shape, num_groups):
+    """Each group has its own copy of the parameters, with an axis of the groups in front."""
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    seen = []
+
+    def apply(params, inputs):
+        seen.append(inputs.shape)
+        return inputs @ params
+
+    outputs = jax.eval_shape(in_groups(apply), jnp.ones((3, 2)), jnp.ones(shape))
+    assert outputs.shape == (*shape[:-1], 2)
+    groups = (math.prod(shape[:-1]) // num_groups, shape[-1])
+    assert seen == [shape if num_groups == 1 else groups]
+
+
+def test_only_the_baseline_may_be_rounded():
+    def precisions(network):
+        params = jax.eval_shape(network.init, jax.random.key(0), jnp.zeros(3))
+        products = jax.make_jaxpr(network.apply)(params, jnp.zeros((4, 3))).eqns
+        return {eqn.params["precision"] for eqn in products if "dot_general" in str(eqn.primitive)}
+
+    exact, rounded = jax.lax.Precision.HIGHEST, jax.lax.Precision.DEFAULT
+    assert precisions(MLP((8,), 2)) == {(exact, exact)}
+    assert precisions(value_network((8,))) == {(rounded, rounded)}
