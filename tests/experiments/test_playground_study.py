@@ -6,6 +6,7 @@ import pytest
 from experiments.kit import rows
 from experiments.studies.playground import __main__ as study
 from experiments.studies.playground import runs, tables
+from mjx_reinforce.files import write_json
 
 RUN = {"date": "", "commit": "", "device": "NVIDIA X", "jax": "", "status": "finished"}
 
@@ -85,6 +86,23 @@ def test_a_page_is_made_of_what_is_kept(tmp_path):
     study.write(data, page)
     assert sum(x.startswith("| HopperHop | X |") for x in page.read_text().splitlines()) == 1
     assert len(tables.results(data)) == 4
+
+
+def test_a_policy_whose_test_broke_counts_as_nothing(tmp_path):
+    """A summary has null for such a seed, and the data nan."""
+    run = tmp_path / "WalkerRun"
+    run.mkdir()
+    write_json(run / "config.json", {"git_commit": "1234567", "device": "NVIDIA X"})
+    summary = {"status": "finished", "compile_seconds": 15.0, "final_test_returns": [None, 700.0]}
+    write_json(run / "summary.json", summary)
+    (run / "metrics.csv").write_text("seed,env_steps,wall_seconds\n0,1000,58.2\n1,3000,58.2\n")
+    path = runs.returns_path(tmp_path, "WalkerRun", 8)
+    runs._write(path, run, 8)
+    assert [row["return"] for row in rows.read(path)] == ["nan", "700"]
+    study.keep(tmp_path, tmp_path)
+    (result,) = tables.results(tmp_path)
+    assert result.returns.tolist() == [0, 700]
+    assert result.env_steps == 2000
 
 
 def test_every_task_has_published_figures():

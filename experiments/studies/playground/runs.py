@@ -126,7 +126,8 @@ def _write(path: Path, run: Path, minutes: float) -> None:
         "seconds": f"{trained_seconds(run):.1f}",
         "compile_seconds": f"{summary['compile_seconds']:.1f}",
     }
-    returns = summary["final_test_returns"]
+    # Of a seed one of whose test episodes broke, the summary has none.
+    returns = np.array(summary["final_test_returns"], float)
     lines = [
         known | {"seed": seed, "return": f"{mean:.7g}", "env_steps": f"{count:.0f}"}
         for seed, (mean, count) in enumerate(zip(returns, steps[-len(returns) :], strict=True))

@@ -30,7 +30,8 @@ _RIVALS = ("Playground, MJX", "Playground, MJX-Warp")
 class Result(NamedTuple):
     """A run: its task, its budget of all seeds together (min), and what its rows say.
 
-    returns: [S] of the seeds' policies, each a mean over fresh episodes
+    returns: [S] of the seeds' policies, each a mean over fresh episodes; of a policy one of whose
+      episodes broke 0, the least that the suite pays
     """
 
     task: str
@@ -51,7 +52,7 @@ def results(data: Path) -> list[Result]:
             task=task,
             minutes=float(minutes),
             device=task_rows[0]["device"],
-            returns=_numbers(task_rows, "return"),
+            returns=np.nan_to_num(_numbers(task_rows, "return")),
             env_steps=float(np.mean(_numbers(task_rows, "env_steps"))),
             seconds=float(task_rows[0]["seconds"]),
         )
