@@ -1,12 +1,13 @@
 """Trains on several devices of one process, and compares what comes out with one device's.
 
 ``python divided.py '[["run", {"num_episodes": 8}, [{"episodes": 8}]]]'`` takes what is compared, a
-whole ``run`` or a ``step`` of its learner, then the settings, and the ways of dividing them.
-Prints a line for each way; raises where something differs.
+whole ``run``, a ``step`` of its learner, or a ``step in groups`` of samples as on a GPU, then the
+settings, and the ways of dividing them. Prints a line for each way; raises where something differs.
 """
 
 import json
 import sys
+from unittest import mock
 
 import jax
 import numpy as np
@@ -14,6 +15,8 @@ from one_slot import compile_run
 
 from mjx_reinforce import envs
 from mjx_reinforce.engine.base import plain
+from mjx_reinforce.engine.episode import largest_divisor
+from mjx_reinforce.learning import updates
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup import build, ready
 from mjx_reinforce.training.division import ALONE, Division
@@ -85,8 +88,12 @@ def compare(kind, settings, divisions):
 
 
 def main():
-    for variant in json.loads(sys.argv[1]):
-        compare(*variant)
+    for kind, *variant in json.loads(sys.argv[1]):
+        most = 4 if kind == "step in groups" else 1
+        with mock.patch.object(
+            updates, "_num_groups", lambda n, most=most: largest_divisor(n, most)
+        ):
+            compare(kind, *variant)
 
 
 if __name__ == "__main__":

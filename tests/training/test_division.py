@@ -27,6 +27,11 @@ VARIANTS = {
         ("step", {"estimator": "value-baseline"}, [{"episodes": 8}]),
         ("step", {"update": "natural-gradient", "max_kl": 0.01}, [{"episodes": 8}]),
         ("step", {"algorithm": "continuous-cartpole"}, [{"episodes": 2}]),
+        (
+            "step in groups",
+            {"estimator": "value-baseline", "update": "natural-gradient", "max_kl": 0.01},
+            [{"episodes": 8}],
+        ),
     ],
 }
 
