@@ -78,7 +78,7 @@ def value_baseline(
       discount: in [0, 1].
       horizon: steps after which the time counts as 1.
       network: a flax module from [..., O + 1], the normalized observation and the time, to
-        [..., 1]; by default an MLP of 64 and 64 tanh units.
+        [..., 1]; by default ``value_network()``, an MLP of 64 and 64 tanh units.
       optimizer: what fits it; by default Adam at 3e-3.
       num_fits: gradient steps on the mean squared error, each update.
       batch_size: steps of the episodes, drawn with replacement, for each of them.
