@@ -81,6 +81,8 @@ def main() -> None:
     parser.add_argument("task")
     parser.add_argument("--num-seeds", type=int, default=8)
     arguments = parser.parse_args()
+    if jax.default_backend() != "gpu":
+        parser.error("sums are in groups on a GPU alone, and JAX finds none here")
     config = of_task(arguments.task, num_seeds=arguments.num_seeds, minutes=1.0)
     print(f"{arguments.task} on {jax.local_devices()[0].device_kind}:")
     for label, seconds in measure(arguments.task, config).items():

@@ -20,6 +20,8 @@ _HARMLESS = (False, None, "allow", "log", "log_explicit")
 def configure_jax() -> None:
     """Turns on exact float32 products and the compilation cache, unless the user chose.
 
+    Products that name a precision have that one, such as those of ``value_network``.
+
     Raises:
       ValueError: JAX finds no device, such as where JAX_PLATFORMS names one that is not here, or is
         set to what the commands cannot work with.

@@ -279,30 +279,32 @@ def in_groups(apply: Callable[[Any, jax.Array], jax.Array]) -> Callable[..., jax
     over all samples. cuBLAS gives an entry's sum to one multiprocessor, so that most of them wait.
 
     Args:
-      apply: (params, inputs [..., O]) -> outputs [..., K] or [...], of each sample by itself.
+      apply: (params, inputs [B, ..., O]) -> outputs [B, ..., K] or [B, ...], of each sample by
+        itself.
     """
 
     def apply_in_groups(params: Any, inputs: jax.Array) -> jax.Array:
         """Returns the outputs of copies of the parameters, one for each group."""
-        *sample_axes, num_inputs = inputs.shape
-        num_groups = _num_groups(math.prod(sample_axes))
+        num_groups = _num_groups(inputs.shape)
         if num_groups == 1:
             return apply(params, inputs)
         # The gradient in a copy is the group's sum. Behind the barrier, XLA does not know that they
         # are copies, and joins no sums.
         copies = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_groups, *x.shape)), params)
-        groups = inputs.reshape(num_groups, -1, num_inputs)
+        # Along the first axis alone: the second may be divided among devices.
+        groups = inputs.reshape(num_groups, -1, *inputs.shape[1:])
         outputs = jax.vmap(apply)(lax.optimization_barrier(copies), groups)
-        return outputs.reshape(*sample_axes, *outputs.shape[2:])
+        return outputs.reshape(-1, *outputs.shape[2:])
 
     return apply_in_groups
 
 
-def _num_groups(num_samples: int) -> int:
-    """Returns in how many groups the gradient of so many samples is summed."""
+def _num_groups(shape: tuple[int, ...]) -> int:
+    """Returns in how many groups of B the gradient of samples [B, ..., O] is summed."""
     if jax.default_backend() == "cpu":
         return 1
-    return largest_divisor(num_samples, max(1, min(_MAX_GROUPS, num_samples // _MIN_GROUP)))
+    num_samples = math.prod(shape[:-1])
+    return largest_divisor(shape[0], max(1, min(_MAX_GROUPS, num_samples // _MIN_GROUP)))
 
 
 def draw_steps(key: jax.Array, mask: jax.Array, shape: tuple[int, ...]) -> jax.Array:

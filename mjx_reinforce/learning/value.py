@@ -33,7 +33,7 @@ _UPDATE_SHARE = 0.1
 def value_network(hidden_sizes: Sequence[int] = (64, 64)) -> nn.Module:
     """Returns a network of tanh units for ``value_baseline``, whose products a GPU may round.
 
-    A product's factors are TF32 on NVIDIA's GPUs, with 11 bits, and twice as fast. Any function of
+    NVIDIA's GPUs round factors to TF32, of 11 bits, and are about twice as fast. Any function of
     the observation and the time leaves the gradient unbiased, a rounded one, too.
     """
     return MLP(tuple(hidden_sizes), 1, precision=lax.Precision.DEFAULT)

@@ -1,6 +1,7 @@
 """What an update's learning takes, with and without sums in groups."""
 
 import dataclasses
+import sys
 
 import pytest
 
@@ -16,3 +17,11 @@ def test_each_way_of_learning_is_timed():
     seconds = updates.measure("HalfCheetah-v5", dataclasses.replace(config, **small))
     assert [*seconds] == ["as it is", "one group", "one group, exact baseline"]
     assert all(x > 0 for x in seconds.values())
+
+
+@pytest.mark.cpu
+def test_without_a_gpu_there_is_nothing_to_compare(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["updates", "HalfCheetah-v5"])
+    with pytest.raises(SystemExit):
+        updates.main()
+    assert "JAX finds none here" in capsys.readouterr().err

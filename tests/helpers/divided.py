@@ -91,7 +91,7 @@ def main():
     for kind, *variant in json.loads(sys.argv[1]):
         most = 4 if kind == "step in groups" else 1
         with mock.patch.object(
-            updates, "_num_groups", lambda n, most=most: largest_divisor(n, most)
+            updates, "_num_groups", lambda shape, most=most: largest_divisor(shape[0], most)
         ):
             compare(kind, *variant)
 

@@ -30,8 +30,8 @@ _RIVALS = ("Playground, MJX", "Playground, MJX-Warp")
 class Result(NamedTuple):
     """A run: its task, its budget of all seeds together (min), and what its rows say.
 
-    returns: [S] of the seeds' policies, each a mean over fresh episodes; of a policy one of whose
-      episodes broke 0, the least that the suite pays
+    returns: [S] of the seeds' policies, each a mean over fresh episodes; 0, the least that the
+      suite pays, for a policy of which a test episode broke
     """
 
     task: str
@@ -52,7 +52,7 @@ def results(data: Path) -> list[Result]:
             task=task,
             minutes=float(minutes),
             device=task_rows[0]["device"],
-            returns=np.nan_to_num(_numbers(task_rows, "return")),
+            returns=_tested(task_rows),
             env_steps=float(np.mean(_numbers(task_rows, "env_steps"))),
             seconds=float(task_rows[0]["seconds"]),
         )
@@ -61,6 +61,12 @@ def results(data: Path) -> list[Result]:
         )
         for task_rows in [list(group)]
     ]
+
+
+def _tested(lines: Iterable[dict[str, Any]]) -> np.ndarray:
+    """Returns the returns of seeds, 0 for one whose test broke."""
+    means = _numbers(lines, "return")
+    return np.where(np.isnan(means), 0.0, means)
 
 
 def _numbers(lines: Iterable[dict[str, Any]], column: str) -> np.ndarray:
