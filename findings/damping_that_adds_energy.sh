@@ -48,7 +48,7 @@ def fastest_damping(angles):
     return values[-1], inverse @ (root * vectors[:, -1])
 
 
-# Climb from pose to pose of the upright humanoid's neighborhood, and on.
+# From the upright pose, climb to poses whose largest eigenvalue is larger.
 random = np.random.default_rng(0)
 angles = np.clip(np.zeros(len(joints)), low, high)
 upright = eigenvalue = fastest_damping(angles)[0]

@@ -94,9 +94,9 @@ def value_baseline(
     """
     for name, count in (("horizon", horizon), ("num_fits", num_fits), ("batch_size", batch_size)):
         check_count(name, count)
-    network = network or value_network()
+    network = value_network() if network is None else network
     returns_to_go = reward_to_go(discount)
-    fitter = optimizer or optax.adam(3e-3)
+    fitter = optax.adam(3e-3) if optimizer is None else optimizer
 
     def value(params, inputs):
         return jnp.asarray(network.apply(params, inputs))[..., 0]
@@ -180,9 +180,9 @@ def full_batch_value_baseline(
       Estimator(of 1 episodes or more)
     """
     check_count("num_fits", num_fits)
-    network = network or MLP((64, 64), 1)
+    network = MLP((64, 64), 1) if network is None else network
     returns_to_go = reward_to_go(discount)
-    fitter = optimizer or optax.adam(3e-3)
+    fitter = optax.adam(3e-3) if optimizer is None else optimizer
 
     def value(params, observation):
         return jnp.asarray(network.apply(params, observation))[..., 0]

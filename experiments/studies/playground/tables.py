@@ -52,7 +52,7 @@ def results(data: Path) -> list[Result]:
             task=task,
             minutes=float(minutes),
             device=task_rows[0]["device"],
-            returns=_tested(task_rows),
+            returns=_test_returns(task_rows),
             env_steps=float(np.mean(_numbers(task_rows, "env_steps"))),
             seconds=float(task_rows[0]["seconds"]),
         )
@@ -63,7 +63,7 @@ def results(data: Path) -> list[Result]:
     ]
 
 
-def _tested(lines: Iterable[dict[str, Any]]) -> np.ndarray:
+def _test_returns(lines: Iterable[dict[str, Any]]) -> np.ndarray:
     """Returns the returns of seeds, 0 for one whose test broke."""
     means = _numbers(lines, "return")
     return np.where(np.isnan(means), 0.0, means)
