@@ -72,9 +72,12 @@ def test_a_page_is_made_of_what_is_kept(tmp_path):
     assert "| 1 | 35.0 (" in hopper
     assert hopper.endswith("| 10.0 | 58 | 2.5e6 | 2 | 2 | 122 | 61 | 188 |")
     # Means are over the tasks that have all figures. PointMass has none of REPPO.
-    assert "| mean of the 3 tasks |  | 1 | 545 |  |  |  | 455 | 500 | 575 |  |  |" in lines
-    means = "| mean of the 2 tasks that all have |  | 1 | 368 |  |  |  | 236 | 302 | 416 |"
+    assert "| mean, 3 tasks |  | 1 | 545 |  |  |  | 455 | 500 | 575 |  |  |" in lines
+    means = "| mean, the 2 that all have |  | 1 | 368 |  |  |  | 236 | 302 | 416 |"
     assert f"{means} 446 | 542 |" in lines
+    # All columns have the one task of eight minutes.
+    assert "| mean, 1 tasks |  | 8 | 800 |  |  |  | 470 | 601 | 711 | 832 | 896 |" in lines
+    assert sum("that all have" in line for line in lines) == 1
     # 900 of 894, 700 of 531, 35 of 8: the task that is most behind stands first.
     places = [of_minutes.index(f"| {task} |") for task in ("PointMass", "WalkerRun", "HopperHop")]
     assert places == sorted(places)

@@ -1,7 +1,6 @@
 """The tables of docs/playground.md: returns after minutes of training beside published ones."""
 
 import itertools
-import statistics
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import fmean
@@ -17,6 +16,8 @@ from experiments.studies.results.tables import compare, estimate, number
 from mjx_reinforce.settings.defaults import SUITE
 from mjx_reinforce.statistics import estimate_mean
 
+#: What every task is trained for, in minutes.
+BUDGETS = (1, 8)
 RETURNS, AGREEMENT, PUBLISHED = "returns.csv", "agreement.csv", "published.csv"
 #: Published means after so many seconds of training.
 PUBLISHED_SECONDS = "published_seconds.csv"
@@ -100,32 +101,32 @@ def returns(data: Path) -> str:
         ]
         for result in measured
     ]
-    if measured:
-        lines += _means(measured, published)
-    return table([*header, *published], lines)
+    return table([*header, *published], lines + _means(measured, published))
 
 
 def _means(measured: Sequence[Result], published: dict[str, dict[str, float]]) -> list[list[str]]:
-    """Returns the lines of means over the tasks of the budget that most have.
+    """Returns the lines of means over the tasks of each of the study's budgets.
 
     The first is over all of them, and beside it the columns that have all; the other one is over
-    those that all columns have.
+    those that all columns have, if these are fewer.
     """
-    minutes = statistics.mode(result.minutes for result in measured)
-    all_tasks = [result for result in measured if result.minutes == minutes]
-    common = [x for x in all_tasks if all(x.task in column for column in published.values())]
-    groups = {f"mean of the {len(all_tasks)} tasks": all_tasks}
-    groups[f"mean of the {len(common)} tasks that all have"] = common
     lines = []
-    for label, group in groups.items():
-        mean = fmean(float(result.returns.mean()) for result in group) if group else None
-        means = [
-            fmean(column[result.task] for result in group)
-            if group and all(result.task in column for result in group)
-            else None
-            for column in published.values()
-        ]
-        lines.append([label, "", f"{minutes:g}", _cell(mean), "", "", "", *map(_cell, means)])
+    for minutes in BUDGETS:
+        all_tasks = [result for result in measured if result.minutes == minutes]
+        common = [x for x in all_tasks if all(x.task in column for column in published.values())]
+        groups = {f"mean, {len(all_tasks)} tasks": all_tasks}
+        groups[f"mean, the {len(common)} that all have"] = common
+        for label, group in groups.items():
+            if not group or (group is common and len(common) == len(all_tasks)):
+                continue
+            mean = fmean(float(result.returns.mean()) for result in group)
+            means = [
+                fmean(column[result.task] for result in group)
+                if all(result.task in column for result in group)
+                else None
+                for column in published.values()
+            ]
+            lines.append([label, "", f"{minutes:g}", _cell(mean), "", "", "", *map(_cell, means)])
     return lines
 
 
