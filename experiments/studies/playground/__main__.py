@@ -3,7 +3,8 @@
     python -m experiments.studies.playground train DIR --minutes 1    # DIR/TASK, DIR/returns
     python -m experiments.studies.playground train DIR --minutes 8    # the same runs go on
     python -m experiments.studies.playground agree DIR                # DIR/agreement.csv
-    python -m experiments.studies.playground keep DIR                 # data, of both
+    python -m experiments.studies.playground breaks DIR --tasks HumanoidRun --seeds 1 3
+    python -m experiments.studies.playground keep DIR                 # data, of all three
     python -m experiments.studies.playground page                     # the tables, from data
 
 ``--minutes`` is for all seeds of a task together, evaluations included; compiling and the test at
@@ -32,12 +33,13 @@ def main() -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("stage", choices=("train", "agree", "keep", "page"))
+    parser.add_argument("stage", choices=("train", "agree", "breaks", "keep", "page"))
     parser.add_argument("directory", type=Path, nargs="?", help="of all stages but page")
     parser.add_argument("--tasks", nargs="+", help="names of the suite; by default the twenty")
     parser.add_argument("--num-seeds", type=int, default=8)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="of breaks")
     parser.add_argument("--minutes", type=float, default=1.0, help="of a task, all seeds together")
-    parser.add_argument("--episodes", type=int, default=100, help="of each side of agree")
+    parser.add_argument("--episodes", type=int, default=100, help="of each count")
     parser.add_argument("--impl", choices=("jax", "warp"), default="jax", help="of agree")
     arguments = parser.parse_args()
     if arguments.directory is None and arguments.stage != "page":
@@ -54,6 +56,11 @@ def main() -> int:
     tasks = arguments.tasks or runs.TASKS
     if arguments.stage == "train":
         return not runs.train(tasks, directory, arguments.num_seeds, arguments.minutes)
+    if arguments.stage == "breaks":
+        from experiments.studies.playground import breaks
+
+        breaks.count(tasks, directory, arguments.seeds, arguments.episodes)
+        return 0
     from experiments.studies.playground import agreement
 
     agreement.compare(tasks, directory, arguments.episodes, arguments.impl)
@@ -67,6 +74,7 @@ def keep(directory: Path, data: Path) -> None:
     sources = {
         tables.RETURNS: sorted(directory.glob("returns/*.csv")),
         tables.AGREEMENT: sorted(directory.glob("agreement.csv")),
+        tables.BREAKS: sorted(directory.glob("breaks.csv")),
     }
     for name, paths in sources.items():
         new = [row for path in paths for row in rows.read(path)]
@@ -90,6 +98,7 @@ def write(data: Path, page: Path) -> None:
         "returns": partial(tables.returns, data),
         "after a minute": partial(tables.after_a_minute, data),
         "agreement": partial(tables.agreement, data),
+        "breaks": partial(tables.breaks, data),
         "speeds": partial(tables.speeds, data),
         "settings": partial(tables.settings, data),
     }

@@ -19,6 +19,7 @@ from mjx_reinforce.statistics import estimate_mean
 #: What every task is trained for, in minutes.
 BUDGETS = (1, 8)
 RETURNS, AGREEMENT, PUBLISHED = "returns.csv", "agreement.csv", "published.csv"
+BREAKS = "breaks.csv"
 #: Published means after so many seconds of training.
 PUBLISHED_SECONDS = "published_seconds.csv"
 #: Rows of ``experiments.speed.benchmark gpu --tasks playground:...``.
@@ -219,3 +220,15 @@ def agreement(data: Path) -> str:
         label = f"{task} (seed {task_rows[0]['seed']})"
         cells.append([label, str(len(ours)), *means, estimate(compare(ours, theirs))])
     return table(["task", "episodes", "here", "Playground", "Playground less here (95%)"], cells)
+
+
+def breaks(data: Path) -> str:
+    """Returns the table of how many episodes broke, by policy and model."""
+    path = data / BREAKS
+    counts: dict[tuple[str, str], dict[str, str]] = {}
+    for row in read(path) if path.exists() else []:
+        cells = counts.setdefault((f"{row['task']} (seed {row['seed']})", row["model"]), {})
+        cells[row["implementation"]] = f"{row['broken']} of {row['episodes']}"
+    names = {"native": "machine code", "mujoco": "C MuJoCo", "MJX": "Playground, MJX"}
+    lines = [[*key, *(cells.get(name, "") for name in names)] for key, cells in counts.items()]
+    return table(["policy", "model", *names.values()], lines)
