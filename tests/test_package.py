@@ -49,6 +49,7 @@ ORDER = [
 #: The floors of the engine, the same way.
 FLOORS = [
     "lazy",
+    "counts",
     "base",
     "memory",
     "checks",

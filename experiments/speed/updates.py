@@ -18,7 +18,7 @@ import jax
 from experiments.speed.benchmark.robots import make
 from mjx_reinforce.engine.devices import executable
 from mjx_reinforce.export.policy_files import build_policy
-from mjx_reinforce.learning import updates
+from mjx_reinforce.learning import samples
 from mjx_reinforce.learning.learner import Learner
 from mjx_reinforce.learning.policy import MLP
 from mjx_reinforce.settings.config import Config
@@ -60,7 +60,7 @@ def measure(task: str, config: Config) -> dict[str, float]:
     states = jax.vmap(learner().init)(keys)
     play = jax.vmap(lambda state, key: learner().play(state, key, True))
     episodes = executable(jax.jit(play).lower(states, keys))(states, keys)
-    one_group = mock.patch.object(updates, "_MAX_GROUPS", 1)
+    one_group = mock.patch.object(samples, "_MAX_GROUPS", 1)
     exact = mock.patch.object(build, "value_network", lambda sizes: MLP(sizes, 1))
     seconds = {"as it is": learning_seconds(learner(), states, episodes, keys)}
     with one_group:

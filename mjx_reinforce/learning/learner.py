@@ -14,6 +14,7 @@ import optax
 from flax import struct
 from jax.flatten_util import ravel_pytree
 
+from mjx_reinforce.engine import counts
 from mjx_reinforce.engine.base import Environment, Trajectory, action_space, observation_size
 from mjx_reinforce.engine.checks import check_count, check_key, check_kind, check_number
 from mjx_reinforce.engine.contract import check_environment
@@ -22,19 +23,13 @@ from mjx_reinforce.engine.episode import check_each, episode_keys
 from mjx_reinforce.engine.play import choice
 from mjx_reinforce.engine.play.choice import Engine, Rollout
 from mjx_reinforce.engine.play.rollouts import episode_lengths, episode_returns
-from mjx_reinforce.learning import contract, counts, diagnostics, normalize, trust_region
+from mjx_reinforce.learning import contract, diagnostics, normalize, trust_region
 from mjx_reinforce.learning.diagnostics import Metrics
 from mjx_reinforce.learning.distributions import default_distribution
 from mjx_reinforce.learning.estimators import Estimator, leave_one_out, standardize
 from mjx_reinforce.learning.policy import Actor, Policy, act, mlp_policy, within_bounds
-from mjx_reinforce.learning.updates import (
-    Clock,
-    Problem,
-    Update,
-    full_batch,
-    in_groups,
-    make_optimizer,
-)
+from mjx_reinforce.learning.samples import in_groups
+from mjx_reinforce.learning.updates import Clock, Problem, Update, full_batch, make_optimizer
 
 
 class TrainState(struct.PyTreeNode, kw_only=True):

@@ -18,13 +18,8 @@ from jax.flatten_util import ravel_pytree
 
 from mjx_reinforce.engine.checks import check_count, check_kind, check_number
 from mjx_reinforce.learning.policy import Policy
-from mjx_reinforce.learning.updates import (
-    Problem,
-    Update,
-    draw_steps,
-    in_groups,
-    whole_rollout,
-)
+from mjx_reinforce.learning.samples import draw_steps, in_groups
+from mjx_reinforce.learning.updates import Problem, Update, whole_rollout
 
 #: Conjugate gradients know F from so many of the visited steps at most.
 MAX_FISHER_STEPS = 4096

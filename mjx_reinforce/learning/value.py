@@ -17,7 +17,7 @@ from mjx_reinforce.engine.checks import check_count
 from mjx_reinforce.engine.episode import while_any
 from mjx_reinforce.learning.estimators import Estimator, explained_variance, reward_to_go
 from mjx_reinforce.learning.policy import MLP
-from mjx_reinforce.learning.updates import (
+from mjx_reinforce.learning.samples import (
     accumulate_gradient,
     chunk_at,
     draw_steps,

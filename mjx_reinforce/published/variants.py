@@ -21,7 +21,8 @@ from mjx_reinforce.learning.estimators import (
     replace_broken,
     stateless,
 )
-from mjx_reinforce.learning.updates import Update, descend, draw_steps, while_needed
+from mjx_reinforce.learning.samples import draw_steps, while_needed
+from mjx_reinforce.learning.updates import Update, descend
 
 
 def mean_log_prob(discount: float | jax.Array = 0.99) -> Estimator:

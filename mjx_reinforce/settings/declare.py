@@ -14,7 +14,7 @@ from mjx_reinforce.engine.checks import MAX_OF_UPDATE
 
 Value = TypeVar("Value")
 
-#: What is counted exactly, as a double does; see ``learning.counts``.
+#: What is counted exactly, as a double does; see ``engine.counts``.
 MAX_COUNT = 2**53
 
 

@@ -13,7 +13,8 @@ from mjx_reinforce.engine.base import Environment, observation_size
 from mjx_reinforce.engine.devices import check_room
 from mjx_reinforce.learning.contract import check_num_steps
 from mjx_reinforce.learning.policy import Policy
-from mjx_reinforce.learning.updates import chunk_length, num_noise_episodes
+from mjx_reinforce.learning.samples import chunk_length
+from mjx_reinforce.learning.updates import num_noise_episodes
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.groups import Reader
 

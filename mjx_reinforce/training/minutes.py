@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.learning import counts
+from mjx_reinforce.engine import counts
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.training.slots import Slots
 from mjx_reinforce.training.state import Budget

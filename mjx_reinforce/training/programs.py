@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from mjx_reinforce.engine import counts
 from mjx_reinforce.engine.base import Environment, Trajectory, plain
 from mjx_reinforce.engine.checks import check_count
 from mjx_reinforce.engine.episode import episode_keys
 from mjx_reinforce.engine.play.rollouts import episode_lengths, episode_returns
-from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.learner import Learner, TrainState
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import MAX_COUNT, Config

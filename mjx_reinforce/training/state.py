@@ -12,8 +12,8 @@ import numpy as np
 from flax import struct
 from jax import lax
 
+from mjx_reinforce.engine import counts
 from mjx_reinforce.engine.base import PyTree, plain, with_keys
-from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import MAX_COUNT, Config

@@ -29,6 +29,15 @@ def write_episodes(folder, task, ours, theirs):
     rows.append(folder / "agreement.csv", lines, columns)
 
 
+def write_breaks(folder, counts):
+    known = {"task": "HumanoidRun", "seed": 2, "model": "as in the file"}
+    lines = [
+        known | {"implementation": name, "episodes": episodes, "broken": broken}
+        for name, (episodes, broken) in counts.items()
+    ]
+    rows.append(folder / "breaks.csv", lines, [*known, "implementation", "episodes", "broken"])
+
+
 def test_sweeps_of_several_tasks_share_a_table(tmp_path):
     """An action of CartpoleSwingup has one entry, one of WalkerRun six."""
     columns = ("task", "max_kl", "initial_std", "entropy_cost", "seed", "final_return")
@@ -53,7 +62,7 @@ def test_a_page_is_made_of_what_is_kept(tmp_path):
         (data / name).write_bytes((study.DATA / name).read_bytes())
     page = tmp_path / "page.md"
     marks = "<!-- not run: a comment -->\n"  # that has no end
-    for mark in ("returns", "after a minute", "agreement"):
+    for mark in ("returns", "after a minute", "agreement", "breaks"):
         marks += f"<!-- {mark} -->\n<!-- end -->\n"
     page.write_text(marks)
     write_run(tmp_path / "one", "HopperHop", 1, [10.0, 20.0, 30.0, 40.0, 50.0, 60.0])
@@ -61,6 +70,8 @@ def test_a_page_is_made_of_what_is_kept(tmp_path):
     write_run(tmp_path / "one", "WalkerRun", 8, [800.0] * 8)
     write_run(tmp_path / "one", "PointMass", 1, [900.0] * 8)
     write_episodes(tmp_path / "one", "WalkerRun", [1.0, 2.0, 3.0], [2.0, 3.0, 4.0])
+    write_episodes(tmp_path / "one", "BallInCup", [975.0, 975.0], [974.0, 974.0])
+    write_breaks(tmp_path / "one", {"native": (20, 3), "MJX": (5, 1)})
     study.keep(tmp_path / "one", data)
     study.write(data, page)
     lines = page.read_text().splitlines()
@@ -83,6 +94,9 @@ def test_a_page_is_made_of_what_is_kept(tmp_path):
     assert places == sorted(places)
     assert "| PointMass | 900.0 (no interval) |  | 894 | 883 |" in lines
     assert any(x.startswith("| WalkerRun (seed 3) | 3 | 2.00 | 3.00 | 1.00 (") for x in lines)
+    # Of episodes that are all alike, there is no interval.
+    assert "| BallInCup (seed 3) | 2 | 975.0 | 974.0 | -1.00 (no interval) |" in lines
+    assert "| HumanoidRun (seed 2) | as in the file | 3 of 20 |  | 1 of 5 |" in lines
     # A run that is kept again replaces what is there.
     write_run(tmp_path / "two", "HopperHop", 1, [1.0] * 8)
     study.keep(tmp_path / "two", data)

@@ -16,7 +16,7 @@ from one_slot import compile_run
 from mjx_reinforce import envs
 from mjx_reinforce.engine.base import plain
 from mjx_reinforce.engine.episode import largest_divisor
-from mjx_reinforce.learning import updates
+from mjx_reinforce.learning import samples
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup import build, ready
 from mjx_reinforce.training.division import ALONE, Division
@@ -91,7 +91,7 @@ def main():
     for kind, *variant in json.loads(sys.argv[1]):
         most = 4 if kind == "step in groups" else 1
         with mock.patch.object(
-            updates, "_num_groups", lambda shape, most=most: largest_divisor(shape[0], most)
+            samples, "_num_groups", lambda shape, most=most: largest_divisor(shape[0], most)
         ):
             compare(kind, *variant)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjx_reinforce.learning.policy import MLP
-from mjx_reinforce.learning.updates import accumulate_gradient, in_groups
+from mjx_reinforce.learning.samples import accumulate_gradient, in_groups
 from mjx_reinforce.learning.value import value_network
 
 

@@ -14,7 +14,8 @@ from brax import envs as brax_envs
 from toys import Drifting, SignedTarget, Survive
 
 from mjx_reinforce import Cut, ars, mlp_policy, normal, reinforce, train_step
-from mjx_reinforce.learning import counts, estimators
+from mjx_reinforce.engine import counts
+from mjx_reinforce.learning import estimators
 from mjx_reinforce.learning import learner as learner_module
 from mjx_reinforce.learning.estimators import discounted_returns
 from mjx_reinforce.learning.value import value_baseline

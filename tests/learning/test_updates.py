@@ -11,7 +11,8 @@ from problems import MASK, PARAMS, START, make_problem, surrogate
 from toys import Survive
 
 from mjx_reinforce import reinforce
-from mjx_reinforce.learning import counts, schedules, updates
+from mjx_reinforce.engine import counts
+from mjx_reinforce.learning import schedules, updates
 from mjx_reinforce.learning.updates import Problem
 from mjx_reinforce.published import variants
 from mjx_reinforce.settings.config import Config

@@ -8,7 +8,7 @@ import pytest
 from toys import SignedTarget, Survive, Target, Tempting
 
 from mjx_reinforce import deterministic, evaluate, mlp_policy, rollout, train_step
-from mjx_reinforce.learning import counts
+from mjx_reinforce.engine import counts
 from mjx_reinforce.published.ars import ars
 from mjx_reinforce.published.continuous_cartpole import increment, random_search
 from mjx_reinforce.settings.config import Config

@@ -12,7 +12,7 @@ from saved_runs import assert_same
 
 from experiments.kit.trainings import results
 from mjx_reinforce import envs
-from mjx_reinforce.learning import counts
+from mjx_reinforce.engine import counts
 from mjx_reinforce.runs.command_line import parse
 from mjx_reinforce.settings import defaults
 from mjx_reinforce.settings.config import MAX_COUNT, Config, check

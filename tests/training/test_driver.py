@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from mjx_reinforce.learning import counts
+from mjx_reinforce.engine import counts
 from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.driver import RunDriver, Runs

@@ -10,8 +10,9 @@ import pytest
 from toys import Survive
 
 import mjx_reinforce as mr
+from mjx_reinforce.engine import counts
 from mjx_reinforce.engine.base import Trajectory
-from mjx_reinforce.learning import counts, normalize, schedules, value
+from mjx_reinforce.learning import normalize, schedules, value
 from mjx_reinforce.learning.updates import Clock
 from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.training.driver import RunDriver

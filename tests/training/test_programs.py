@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from flax import struct
 
-from mjx_reinforce.learning import counts
+from mjx_reinforce.engine import counts
 from mjx_reinforce.training import programs
 from mjx_reinforce.training.state import Budget, RunState
 

@@ -13,8 +13,8 @@ from measured_runs import ONE, make_measured_run
 from pages import findings_of
 from saved_runs import assert_same
 
+from mjx_reinforce.engine import counts
 from mjx_reinforce.export.policy_files import read_policy
-from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.reports import words
 from mjx_reinforce.reports.findings import compute_findings

@@ -10,8 +10,8 @@ from one_slot import compile_run
 from toys import Toy
 
 from mjx_reinforce import envs
+from mjx_reinforce.engine import counts
 from mjx_reinforce.engine.base import plain
-from mjx_reinforce.learning import counts
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.setup import ready
 from mjx_reinforce.training.state import seed_keys

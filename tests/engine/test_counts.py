@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mjx_reinforce.learning import counts
+from mjx_reinforce.engine import counts
 
 COUNT = st.one_of(st.integers(0, 2**53), st.sampled_from([2**31, 2**32 - 1, 2**32, 2**53]))
 
