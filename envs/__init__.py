@@ -280,7 +280,7 @@ def check_id(id: str) -> None:
             checks.check_name("environment", id, _TABLE)
         except ValueError as error:
             raise ValueError(f"{error} Your own is named module:Class.") from None
-    elif not re.fullmatch(r"\w+(\.\w+)*:\w+", id):
+    elif not id.startswith(_PLAYGROUND) and not re.fullmatch(r"\w+(\.\w+)*:\w+", id):
         raise ValueError(
             f"the environment {id!r} is not of the form module:Class, such as own_model:Crane for "
             "the class Crane in own_model.py"

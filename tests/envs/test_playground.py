@@ -282,6 +282,8 @@ def test_what_no_engine_can_is_refused(task, message):
 def test_what_is_missing_is_said():
     with pytest.raises(ValueError, match=r"unknown task of Playground 'WalkerRum'.*'WalkerRun'"):
         envs.from_playground("WalkerRum")
+    with pytest.raises(ValueError, match=r"unknown task of Playground ''\. Known: Acrobot"):
+        envs.make("playground:")
     with pytest.raises(ValueError, match=r"unknown entry of the configuration of .*'sim_dt'"):
         envs.from_playground("PendulumSwingup", sim_dts=0.1)
     with pytest.raises(ValueError, match="are for a name; this task is made already"):

@@ -131,6 +131,8 @@ def test_every_task_has_published_figures():
 @pytest.mark.slow
 def test_a_run_goes_on_for_more_minutes_and_is_not_repeated(tmp_path, monkeypatch, capsys):
     pytest.importorskip("mujoco_playground")
+    from experiments.studies.playground import breaks
+
     monkeypatch.setattr(runs, "TEST_EPISODES", 2)
     tasks = ["NoSuchTask", "PendulumSwingup"]
     assert not runs.train(tasks, tmp_path, num_seeds=2, minutes=0.02)
@@ -146,3 +148,23 @@ def test_a_run_goes_on_for_more_minutes_and_is_not_repeated(tmp_path, monkeypatc
     steps = [np.array([float(row["env_steps"]) for row in x]) for x in (first, second)]
     assert (steps[1] > steps[0]).all()
     assert float(second[0]["seconds"]) > float(first[0]["seconds"])
+    # The pendulum has nothing to break, in any implementation.
+    breaks.count(tasks[1:], tmp_path, seeds=[1], num_episodes=8, models=[breaks.AS_IN_THE_FILE])
+    counts = {row["implementation"]: row for row in rows.read(tmp_path / "breaks.csv")}
+    assert {name: row["episodes"] for name, row in counts.items()} == {
+        "native": "8",
+        "mujoco": "8",
+        "MJX": "2",
+    }
+    assert {row["broken"] for row in counts.values()} == {"0"}
+
+
+def test_options_of_a_model_keep_the_time_of_an_env_step():
+    pytest.importorskip("mujoco_playground")
+    from experiments.studies.playground import breaks
+
+    options = breaks.MODELS["implicit damping, 100 iterations"] | {"timestep": 0.0025}
+    task = breaks.with_options("HumanoidRun", options)
+    assert task.n_substeps == 10
+    assert task.n_substeps * float(task.mjx_model.opt.timestep) == pytest.approx(0.025)
+    assert (task.mjx_model.opt.disableflags, task.mjx_model.opt.iterations) == (0, 100)

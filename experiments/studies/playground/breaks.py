@@ -96,7 +96,7 @@ def with_options(task: str, options: dict[str, Any]) -> Any:
     env: Any = registry.load(task, config_overrides={"impl": "jax"})
     for name, value in options.items():
         setattr(env.mj_model.opt, name, value)
-    env._config.sim_dt = env.mj_model.opt.timestep
+    env._sim_dt = env.mj_model.opt.timestep
     env._mjx_model = mjx.put_model(env.mj_model, impl="jax")
     return env
 
