@@ -1,11 +1,10 @@
 #!/usr/bin/env bash
-# playground 0.2.0: implicit damping makes the Humanoid break. Its file has two settings that
-# dm_control's has not: four iterations of the solver, and no implicit damping in MuJoCo's Euler
-# integrator (eulerdamp). With implicit damping, the more stable of the two by itself, and the file's
-# four iterations, C MuJoCo leaves the finite numbers in 5 of 20 episodes of random actions within
-# 400 env steps, and with two iterations in all 20. With explicit damping, as in the file, none of
-# the 20 breaks, even with two iterations; nor with implicit damping and 100 iterations. So an
-# iteration limit that was chosen with one kind of damping does not carry over to the other.
+# playground 0.2.0: with the solver's four iterations of its file, implicit damping makes the Humanoid
+# break. The file also turns implicit damping off in MuJoCo's Euler integrator (eulerdamp). With it
+# on, C MuJoCo warns of a bad or huge state in several of 20 episodes of random actions (5 where we
+# ran it) within 400 env steps, and with two iterations in all 20. With explicit damping, as in the
+# file, it warns in none, even with two iterations; nor with implicit damping and 100 iterations. So
+# a number of iterations that was chosen with one kind of damping does not carry over to the other.
 # Seen with: mujoco and mujoco-mjx 3.17.0, jax 0.10.2, Python 3.11. Fails if that changes.
 set -euo pipefail
 folder=$(mktemp -d)
@@ -25,7 +24,7 @@ WARNINGS = [getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}") for name in ("QPOS",
 
 task = registry.load("HumanoidWalk", config_overrides={"impl": "jax"})
 model = task.mj_model
-assert (model.opt.iterations, model.opt.ls_iterations) == (4, 8)
+assert model.opt.iterations == 4
 assert model.opt.disableflags == EXPLICIT
 
 
@@ -41,10 +40,9 @@ def is_broken(random):
     return False
 
 
-def num_broken(flags, iterations, search_iterations):
+def num_broken(flags, iterations):
     model.opt.disableflags = flags
     model.opt.iterations = iterations
-    model.opt.ls_iterations = search_iterations
     random = np.random.default_rng(0)
     count = sum(is_broken(random) for _ in range(EPISODES))
     damping = "explicit" if flags == EXPLICIT else "implicit"
@@ -52,9 +50,9 @@ def num_broken(flags, iterations, search_iterations):
     return count
 
 
-assert num_broken(EXPLICIT, 4, 8) == 0
-assert num_broken(EXPLICIT, 2, 8) == 0
-assert num_broken(IMPLICIT, 4, 8) >= 2
-assert num_broken(IMPLICIT, 2, 8) == EPISODES
-assert num_broken(IMPLICIT, 100, 50) == 0
+assert num_broken(EXPLICIT, 4) == 0
+assert num_broken(EXPLICIT, 2) == 0
+assert num_broken(IMPLICIT, 4) > 1
+assert num_broken(IMPLICIT, 2) == EPISODES
+assert num_broken(IMPLICIT, 100) == 0
 PROGRAM

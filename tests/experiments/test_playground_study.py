@@ -29,8 +29,8 @@ def write_episodes(folder, task, ours, theirs):
     rows.append(folder / "agreement.csv", lines, columns)
 
 
-def write_breaks(folder, counts):
-    known = {"task": "HumanoidRun", "seed": 2, "model": "as in the file"}
+def write_breaks(folder, seed, counts):
+    known = {"task": "HumanoidRun", "seed": seed, "model": "as in the file"}
     lines = [
         known | {"implementation": name, "episodes": episodes, "broken": broken}
         for name, (episodes, broken) in counts.items()
@@ -71,7 +71,7 @@ def test_a_page_is_made_of_what_is_kept(tmp_path):
     write_run(tmp_path / "one", "PointMass", 1, [900.0] * 8)
     write_episodes(tmp_path / "one", "WalkerRun", [1.0, 2.0, 3.0], [2.0, 3.0, 4.0])
     write_episodes(tmp_path / "one", "BallInCup", [975.0, 975.0], [974.0, 974.0])
-    write_breaks(tmp_path / "one", {"native": (20, 3), "MJX": (5, 1)})
+    write_breaks(tmp_path / "one", 2, {"native": (20, 3), "MJX": (5, 1)})
     study.keep(tmp_path / "one", data)
     study.write(data, page)
     lines = page.read_text().splitlines()
@@ -83,12 +83,12 @@ def test_a_page_is_made_of_what_is_kept(tmp_path):
     assert "| 1 | 35.0 (" in hopper
     assert hopper.endswith("| 10.0 | 58 | 2.5e6 | 2 | 2 | 122 | 61 | 188 |")
     # Means are over the tasks that have all figures. PointMass has none of REPPO.
-    assert "| mean, 3 tasks |  | 1 | 545 |  |  |  | 455 | 500 | 575 |  |  |" in lines
-    means = "| mean, the 2 that all have |  | 1 | 368 |  |  |  | 236 | 302 | 416 |"
+    assert "| mean of the tasks (3) |  | 1 | 545 |  |  |  | 455 | 500 | 575 |  |  |" in lines
+    means = "| mean of the tasks of all columns (2) |  | 1 | 368 |  |  |  | 236 | 302 | 416 |"
     assert f"{means} 446 | 542 |" in lines
     # All columns have the one task of eight minutes.
-    assert "| mean, 1 tasks |  | 8 | 800 |  |  |  | 470 | 601 | 711 | 832 | 896 |" in lines
-    assert sum("that all have" in line for line in lines) == 1
+    assert "| mean of the tasks (1) |  | 8 | 800 |  |  |  | 470 | 601 | 711 | 832 | 896 |" in lines
+    assert sum("tasks of all columns (" in line for line in lines) == 1
     # 900 of 894, 700 of 531, 35 of 8: the task that is most behind stands first.
     places = [of_minutes.index(f"| {task} |") for task in ("PointMass", "WalkerRun", "HopperHop")]
     assert places == sorted(places)
@@ -99,10 +99,14 @@ def test_a_page_is_made_of_what_is_kept(tmp_path):
     assert "| HumanoidRun (seed 2) | as in the file | 3 of 20 |  | 1 of 5 |" in lines
     # A run that is kept again replaces what is there.
     write_run(tmp_path / "two", "HopperHop", 1, [1.0] * 8)
+    write_breaks(tmp_path / "two", 1, {"native": (20, 4)})
     study.keep(tmp_path / "two", data)
     study.write(data, page)
     assert sum(x.startswith("| HopperHop | X |") for x in page.read_text().splitlines()) == 1
     assert len(tables.results(data)) == 4
+    # A count of another policy is beside those that were there.
+    places = [page.read_text().index(f"| HumanoidRun (seed {seed}) |") for seed in (1, 2)]
+    assert places == sorted(places)
 
 
 def test_a_policy_whose_test_broke_counts_as_nothing(tmp_path):
@@ -163,8 +167,8 @@ def test_options_of_a_model_keep_the_time_of_an_env_step():
     pytest.importorskip("mujoco_playground")
     from experiments.studies.playground import breaks
 
-    options = breaks.MODELS["implicit damping, 100 iterations"] | {"timestep": 0.0025}
-    task = breaks.with_options("HumanoidRun", options)
+    changes = ("implicit damping, 100 iterations", "half the timestep")
+    task = breaks.changed("HumanoidRun", [x for name in changes for x in breaks.MODELS[name]])
     assert task.n_substeps == 10
     assert task.n_substeps * float(task.mjx_model.opt.timestep) == pytest.approx(0.025)
     assert (task.mjx_model.opt.disableflags, task.mjx_model.opt.iterations) == (0, 100)

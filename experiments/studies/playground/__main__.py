@@ -1,9 +1,10 @@
-"""Tasks of MuJoCo Playground's suite, trained for minutes: the tables of docs/playground.md.
+r"""Tasks of MuJoCo Playground's suite, trained for minutes: the tables of docs/playground.md.
 
     python -m experiments.studies.playground train DIR --minutes 1    # DIR/TASK, DIR/returns
     python -m experiments.studies.playground train DIR --minutes 8    # the same runs go on
     python -m experiments.studies.playground agree DIR                # DIR/agreement.csv
-    python -m experiments.studies.playground breaks DIR --tasks HumanoidRun --seeds 1 3
+    python -m experiments.studies.playground breaks DIR --episodes 128 \
+        --tasks HumanoidRun --seeds 1 3                   # and HumanoidWalk, seed 7
     python -m experiments.studies.playground keep DIR                 # data, of all three
     python -m experiments.studies.playground page                     # the tables, from data
 
@@ -39,7 +40,9 @@ def main() -> int:
     parser.add_argument("--num-seeds", type=int, default=8)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="of breaks")
     parser.add_argument("--minutes", type=float, default=1.0, help="of a task, all seeds together")
-    parser.add_argument("--episodes", type=int, default=100, help="of each count")
+    parser.add_argument(
+        "--episodes", type=int, default=100, help="of each count; in MJX, breaks plays a quarter"
+    )
     parser.add_argument("--impl", choices=("jax", "warp"), default="jax", help="of agree")
     arguments = parser.parse_args()
     if arguments.directory is None and arguments.stage != "page":
@@ -68,7 +71,7 @@ def main() -> int:
 
 
 def keep(directory: Path, data: Path) -> None:
-    """Adds the returns of a directory to the data, in place of those of the same runs."""
+    """Adds the rows of a directory to the data, in place of those of the same runs and counts."""
     from experiments.studies.playground import tables
 
     sources = {
@@ -86,7 +89,9 @@ def keep(directory: Path, data: Path) -> None:
 
 
 def _key(row: dict[str, str]) -> tuple[str, ...]:
-    """Returns which run a row is of; of one task, another device replaces what is there."""
+    """Returns which run or count a row is of; another device replaces what is there."""
+    if "model" in row:
+        return row["task"], row["seed"], row["model"]
     return row["task"], row.get("minutes", "")
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from mujoco import mjx
 from mujoco_playground import registry
@@ -26,16 +27,29 @@ COLUMNS: tuple[str, ...] = (
 #: Env steps of each episode.
 ENV_STEPS = 300
 AS_IN_THE_FILE = "as in the file"
+_C: Any = mujoco  # whose stubs lack the flags
+_NO_IMPLICIT_DAMPING = int(_C.mjtDisableBit.mjDSBL_EULERDAMP)
+
+
+def _implicit_damping(options: Any) -> None:
+    options.disableflags &= ~_NO_IMPLICIT_DAMPING
+
+
+def _many_iterations(options: Any) -> None:
+    options.iterations = 100
+
+
+def _half_the_timestep(options: Any) -> None:
+    options.timestep /= 2
+
+
 #: What is changed of the task's model.
-MODELS: dict[str, dict[str, Any]] = {
-    AS_IN_THE_FILE: {},
-    "implicit damping": {"disableflags": 0},
-    "implicit damping, 100 iterations": {
-        "disableflags": 0,
-        "iterations": 100,
-        "ls_iterations": 50,
-    },
-    "half the timestep": {"timestep": 0.0025},
+MODELS: dict[str, tuple[Callable[[Any], None], ...]] = {
+    AS_IN_THE_FILE: (),
+    "100 iterations": (_many_iterations,),
+    "implicit damping": (_implicit_damping,),
+    "implicit damping, 100 iterations": (_implicit_damping, _many_iterations),
+    "half the timestep": (_half_the_timestep,),
 }
 
 
@@ -49,7 +63,7 @@ def count(
     """Plays policies with noise, and writes FOLDER/breaks.csv as it goes.
 
     Args:
-      tasks: Humanoids, of which FOLDER/TASK is a run.
+      tasks: FOLDER/TASK is a run.
       folder: of the runs.
       seeds: whose policies, of the run's end.
       num_episodes: of each count; MJX plays a quarter, and only the model of the file.
@@ -60,7 +74,7 @@ def count(
         for seed in seeds:
             policy, actor = load_policy(folder / task / "policy", seed)
             for model in models:
-                env = with_options(task, MODELS[model])
+                env = changed(task, MODELS[model])
                 counts = {
                     engine: (num_episodes, broken_here(env, policy, actor, num_episodes, engine))
                     for engine in ("native", "mujoco")
@@ -86,16 +100,16 @@ def _write(
     rows.append(path, lines, COLUMNS)
 
 
-def with_options(task: str, options: dict[str, Any]) -> Any:
-    """Returns a task of Playground whose model has other options, in env steps as long as before.
+def changed(task: str, changes: Sequence[Callable[[Any], None]]) -> Any:
+    """Returns a task of Playground with another model, whose env steps are as long as before.
 
     Args:
       task: a name of the suite.
-      options: fields of ``MjModel.opt``.
+      changes: of the model's options, in place.
     """
     env: Any = registry.load(task, config_overrides={"impl": "jax"})
-    for name, value in options.items():
-        setattr(env.mj_model.opt, name, value)
+    for change in changes:
+        change(env.mj_model.opt)
     env._sim_dt = env.mj_model.opt.timestep
     env._mjx_model = mjx.put_model(env.mj_model, impl="jax")
     return env

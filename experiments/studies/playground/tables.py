@@ -85,7 +85,7 @@ def _published(data: Path) -> dict[str, dict[str, float]]:
 
 
 def returns(data: Path) -> str:
-    """Returns the table of all tasks, with a last row of means over those of every column."""
+    """Returns the table of all tasks, with last rows of means, by budget."""
     published = _published(data)
     measured = results(data)
     header = ["task", "on", "minutes", "mean (95%)", "worst seed", "seconds", "env steps a seed"]
@@ -115,8 +115,8 @@ def _means(measured: Sequence[Result], published: dict[str, dict[str, float]]) -
     for minutes in BUDGETS:
         all_tasks = [result for result in measured if result.minutes == minutes]
         common = [x for x in all_tasks if all(x.task in column for column in published.values())]
-        groups = {f"mean, {len(all_tasks)} tasks": all_tasks}
-        groups[f"mean, the {len(common)} that all have"] = common
+        groups = {f"mean of the tasks ({len(all_tasks)})": all_tasks}
+        groups[f"mean of the tasks of all columns ({len(common)})"] = common
         for label, group in groups.items():
             if not group or (group is common and len(common) == len(all_tasks)):
                 continue
@@ -219,7 +219,7 @@ def agreement(data: Path) -> str:
         means = (number(float(x.mean())) for x in (ours, theirs))
         label = f"{task} (seed {task_rows[0]['seed']})"
         if _are_alike(ours) and _are_alike(theirs):
-            # Every episode has the same start: these are one episode, many times.
+            # One return tells nothing of others, as where all episodes have the same start.
             difference = Estimate(float(theirs.mean() - ours.mean()), np.nan, np.nan)
         else:
             difference = compare(ours, theirs)
@@ -236,7 +236,10 @@ def breaks(data: Path) -> str:
     """Returns the table of how many episodes broke, by policy and model."""
     path = data / BREAKS
     counts: dict[tuple[str, str], dict[str, str]] = {}
-    for row in read(path) if path.exists() else []:
+    rows = read(path) if path.exists() else []
+    models = list(dict.fromkeys(row["model"] for row in rows))
+    rows.sort(key=lambda row: (row["task"], row["seed"], models.index(row["model"])))
+    for row in rows:
         cells = counts.setdefault((f"{row['task']} (seed {row['seed']})", row["model"]), {})
         cells[row["implementation"]] = f"{row['broken']} of {row['episodes']}"
     names = {"native": "machine code", "mujoco": "C MuJoCo", "MJX": "Playground, MJX"}
