@@ -152,8 +152,9 @@ def test_a_run_goes_on_for_more_minutes_and_is_not_repeated(tmp_path, monkeypatc
     steps = [np.array([float(row["env_steps"]) for row in x]) for x in (first, second)]
     assert (steps[1] > steps[0]).all()
     assert float(second[0]["seconds"]) > float(first[0]["seconds"])
-    # The pendulum has nothing to break, in any implementation.
-    breaks.count(tasks[1:], tmp_path, seeds=[1], num_episodes=8, models=[breaks.AS_IN_THE_FILE])
+    # The pendulum has nothing to break, in any implementation. What has no run is named.
+    breaks.count(tasks, tmp_path, seeds=[1], num_episodes=8, models=[breaks.AS_IN_THE_FILE])
+    assert "NoSuchTask, seed 1: failed, cannot read" in capsys.readouterr().out
     counts = {row["implementation"]: row for row in rows.read(tmp_path / "breaks.csv")}
     assert {name: row["episodes"] for name, row in counts.items()} == {
         "native": "8",

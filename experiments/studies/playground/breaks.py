@@ -60,7 +60,7 @@ def count(
     num_episodes: int,
     models: Sequence[str] = tuple(MODELS),
 ) -> None:
-    """Plays policies with noise, and writes FOLDER/breaks.csv as it goes.
+    """Plays policies with noise, and writes FOLDER/breaks.csv as it goes; what fails is named.
 
     Args:
       tasks: FOLDER/TASK is a run.
@@ -72,17 +72,26 @@ def count(
     configure_jax()
     for task in tasks:
         for seed in seeds:
-            policy, actor = load_policy(folder / task / "policy", seed)
-            for model in models:
-                env = changed(task, MODELS[model])
-                counts = {
-                    engine: (num_episodes, broken_here(env, policy, actor, num_episodes, engine))
-                    for engine in ("native", "mujoco")
-                }
-                if model == AS_IN_THE_FILE:
-                    few = num_episodes // 4
-                    counts["MJX"] = few, broken_in_mjx(env, policy, actor, few)
-                _write(folder / "breaks.csv", task, seed, model, counts)
+            try:
+                _count(task, folder, seed, num_episodes, models)
+            except (ValueError, RuntimeError, ImportError) as error:
+                print(f"{task}, seed {seed}: failed, {error}", flush=True)
+
+
+def _count(task: str, folder: Path, seed: int, num_episodes: int, models: Sequence[str]) -> None:
+    """Plays the policy of a seed, as ``count`` says."""
+    policy, actor = load_policy(folder / task / "policy", seed)
+    for model in models:
+        env = changed(task, MODELS[model])
+        counts = {
+            engine: (num_episodes, broken_here(env, policy, actor, num_episodes, engine))
+            for engine in ("native", "mujoco")
+        }
+        if model == AS_IN_THE_FILE:
+            # Its step is slow on a CPU.
+            few = max(1, num_episodes // 4)
+            counts["MJX"] = few, broken_in_mjx(env, policy, actor, few)
+        _write(folder / "breaks.csv", task, seed, model, counts)
 
 
 def _write(
