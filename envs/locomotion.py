@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
-from mjx_reinforce.envs.base import NearPose
+from mjx_reinforce.envs.near_pose import NearPose
 from mjx_reinforce.envs.settings import Interval
 
 

@@ -5,7 +5,7 @@ import hashlib
 import importlib.resources
 import re
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -50,6 +50,8 @@ _MAY_BE_INFINITE = re.compile(r".*(range|cutoff|lengthspring|yield)")
 _DERIVED = re.compile(r"stat\..*|body_(margin|subtreemass)|.*(_aabb|[^s]0)")
 #: What MuJoCo calls a model without a name.
 _NAMELESS = "MuJoCo Model"
+#: Arrays by their names: fields of mjData or mjModel, and what else an episode draws or remembers.
+Fields = dict[str, jax.Array]
 #: The name of a file, an ``MjSpec`` or an ``MjModel``, which MuJoCo does not declare.
 ModelSource: TypeAlias = Any
 
@@ -205,6 +207,11 @@ def replaced(episode: dict[str, Any]) -> dict[str, Any]:
       episode: what ``MujocoEnv.randomize`` returned.
     """
     return {name: value for name, value in episode.items() if name in RANDOM}
+
+
+def fields_of(source: Any, names: Iterable[str]) -> dict[str, Any]:
+    """Returns fields of a simulation, or of what has some of its fields, by their names."""
+    return {name: getattr(source, name) for name in names}
 
 
 def make_data(model: MjModel) -> mjx.Data:

@@ -21,6 +21,11 @@ def start_shapes(model: MjModel) -> dict[str, tuple[int, ...]]:
     }
 
 
+def mocap_poses(fields: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """Returns the poses of mocap bodies among fields of a start, or of what is carried."""
+    return {name: fields[name] for name in MOCAP if name in fields}
+
+
 def key_frame(model: MjModel, name: str | int) -> dict[str, jax.Array]:
     """Returns all of a key frame but its time, by mjData's names, see ``start_shapes``.
 

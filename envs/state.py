@@ -1,16 +1,20 @@
 """What an env step hands to the next, and what a task knows of its start."""
 
+import dataclasses
 from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
+from brax.envs.base import State
 from flax import struct
+from mujoco import mjx  # pyright: ignore[reportAttributeAccessIssue] (a C extension)
 
 from mjx_reinforce.engine.base import MjModel
 from mjx_reinforce.engine.checks import check_count
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
 from mjx_reinforce.engine.play.counter import key_of_words
-from mjx_reinforce.envs.outcomes import check_memory
+from mjx_reinforce.envs.models import CARRIED, CONSTANT, Fields, fields_of
+from mjx_reinforce.envs.outcomes import check_memory, check_outcome
 from mjx_reinforce.envs.views import Named
 
 
@@ -35,10 +39,10 @@ class Physics:
     qvel: jax.Array
     act: jax.Array
     qacc_warmstart: jax.Array
-    carried: dict[str, jax.Array] = struct.field(default_factory=dict)
-    episode: dict[str, jax.Array] = struct.field(default_factory=dict)
-    constants: dict[str, jax.Array] = struct.field(default_factory=dict)
-    memory: dict[str, jax.Array] = struct.field(default_factory=dict)
+    carried: Fields = struct.field(default_factory=dict)
+    episode: Fields = struct.field(default_factory=dict)
+    constants: Fields = struct.field(default_factory=dict)
+    memory: Fields = struct.field(default_factory=dict)
     key: jax.Array | tuple[()] = ()
 
 
@@ -47,7 +51,7 @@ class Before(Named, Simulation):
 
     def __init__(
         self,
-        fields: dict[str, jax.Array],
+        fields: Fields,
         mj_model: MjModel,
         episode: dict[str, Any],
         memory: dict[str, Any] | None = None,
@@ -68,7 +72,7 @@ class Before(Named, Simulation):
 class Recollection(NamedTuple):
     """The two fields of ``Physics`` that change with what an episode remembers."""
 
-    memory: dict[str, jax.Array]
+    memory: Fields
     key: jax.Array | tuple[()]
 
 
@@ -134,3 +138,85 @@ def observed(env: Any, view: Any, last_frames: jax.Array | None = None) -> jax.A
     if last_frames is None:
         return jnp.tile(observation, env.frames)
     return jnp.concatenate([last_frames[observation.shape[0] :], observation])
+
+
+def physics_state(
+    env: Any, view: Any, constants: Fields, carried: Fields, recollection: Recollection
+) -> Physics:
+    """Returns what the next env step needs to know of a simulation.
+
+    Args:
+      env: the ``MujocoEnv``.
+      view: the simulation, as the task reads it.
+      constants: fields of the model that follow from its episode, see ``derived.constants``.
+      carried: what is carried beside the fields that the task has asked for, by names.
+      recollection: what the episode remembers.
+    """
+    return Physics(
+        **fields_of(view, CARRIED),
+        carried=fields_of(view, env.carried) | carried,
+        episode=view.episode,
+        constants=constants,
+        **recollection._asdict(),
+    )
+
+
+def before_of(mj_model: MjModel, state: Physics, data: mjx.Data) -> Before:
+    """Returns what a task knows of the start of an env step.
+
+    Args:
+      mj_model: the model.
+      state: what the env step before has handed on.
+      data: what no physics step changes of the simulation.
+    """
+    # The state's own come last: a task may have asked to carry one of these, too.
+    fields = fields_of(data, CONSTANT) | state.carried | fields_of(state, CARRIED)
+    return Before(fields, mj_model, state.episode, state.memory)
+
+
+def first_state(env: Any, physics: Physics, before: Before, view: Any) -> State:
+    """Returns the state of an episode before its first env step.
+
+    Args:
+      env: the ``MujocoEnv``.
+      physics: what its first env step needs.
+      before: what the task knows of the start of that.
+      view: the simulation, as the task reads it.
+    """
+    # No env step was made: the outcome says only which terms there are, each 0 so far. Wrappers
+    # and loops need a state of one structure from the first step on.
+    zero = jnp.zeros((), physics.qpos.dtype)
+    action = jnp.zeros(env.action_size, zero.dtype)
+    terms = check_outcome(type(env).__name__, env.outcome(before, view, action))[2]
+    metrics = dict.fromkeys(terms, zero)
+    return State(cast(Any, physics), observed(env, view), zero, zero, metrics)
+
+
+def next_state(
+    env: Any,
+    state: State,
+    physics: Physics,
+    view: Any,
+    outcome: tuple[Any, Any, dict[str, Any]],
+    is_sound: jax.Array,
+) -> State:
+    """Returns the state after an env step.
+
+    Args:
+      env: the ``MujocoEnv``.
+      state: the state before it.
+      physics: what the next env step needs.
+      view: the simulation after it, as the task reads it.
+      outcome: what the task's ``outcome`` returned.
+      is_sound: [] whether C MuJoCo would go on; else the reward is NaN.
+    """
+    reward, terminated, terms = outcome
+    dtype = state.reward.dtype
+    return dataclasses.replace(
+        state,
+        pipeline_state=physics,
+        obs=observed(env, view, cast(jax.Array, state.obs)),
+        reward=jnp.where(is_sound, jnp.asarray(reward, dtype), jnp.nan),
+        done=jnp.asarray(terminated, dtype),
+        metrics=state.metrics | jax.tree.map(lambda x: jnp.asarray(x, dtype), terms),
+    )

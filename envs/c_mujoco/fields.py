@@ -52,23 +52,38 @@ class FieldRecorder(Named):
         return jnp.zeros(spec.shape, spec.dtype)
 
 
-def read_all(env: Any, before: Before, recorder: Any, action: jax.Array) -> None:
-    """Calls the methods of a task that read a simulation; which fields these are is recorded.
+def fields_read(
+    env: Any, data: Any, start_fields: dict[str, Any], episode: dict[str, Any]
+) -> set[str]:
+    """Returns which fields of mjData the methods of a task read of a simulation.
+
+    That does not depend on their numbers: the methods are traced, as under jit.
 
     Args:
       env: the ``MujocoEnv``.
-      before: the start of an env step.
-      recorder: a ``FieldRecorder`` in place of the simulation after it.
-      action: [A] of any numbers.
+      data: an ``MjData`` of its model, which stays as it is.
+      start_fields: what the task knows of the start of an env step, by mjData's names.
+      episode: what ``randomize`` returned, or what has its shapes.
+
+    Raises:
+      ValueError: the task reads what C MuJoCo has in no array of a fixed size.
     """
-    recollection = recollect_start(env, jax.random.key(0), recorder)
-    before.memory = dict(recollection.memory)
-    env.actuate(before, action)
-    if env.has_pushes:
-        env.push(before)
-    recollect_step(env, recollection, recorder, action)
-    env.outcome(before, recorder, action)
-    env.observe(recorder)
+    recorder: Any = FieldRecorder(data, env.mj_model)
+
+    def read(start_fields: dict[str, Any], episode: dict[str, Any], action: jax.Array) -> None:
+        """Calls the methods, of the start of an episode and of an env step."""
+        recorder.episode = episode
+        recollection = recollect_start(env, jax.random.key(0), recorder)
+        before = Before(start_fields, env.mj_model, episode, recollection.memory)
+        env.actuate(before, action)
+        if env.has_pushes:
+            env.push(before)
+        recollect_step(env, recollection, recorder, action)
+        env.outcome(before, recorder, action)
+        env.observe(recorder)
+
+    jax.eval_shape(read, start_fields, episode, jnp.zeros(env.action_size))
+    return recorder.names
 
 
 def spec_of(data: Any, name: str) -> Spec:

@@ -6,7 +6,6 @@ step (mjtState's mjSTATE_INTEGRATION) is carried in float64, also by a float32 p
 episode has C's own bits.
 """
 
-import dataclasses
 import functools
 import hashlib
 from collections.abc import Sequence
@@ -22,11 +21,20 @@ from mjx_reinforce.engine.base import MjModel, observation_size
 from mjx_reinforce.engine.contract import check_shape
 from mjx_reinforce.engine.cpu.host import HostCall, HostFunction, Spec
 from mjx_reinforce.envs import models
-from mjx_reinforce.envs.c_mujoco.fields import FieldRecorder, read_all, spec_of
+from mjx_reinforce.envs.c_mujoco.fields import fields_read, spec_of
 from mjx_reinforce.envs.c_mujoco.simulations import Simulations
+from mjx_reinforce.envs.models import Fields
 from mjx_reinforce.envs.outcomes import check_control, check_outcome, check_push
 from mjx_reinforce.envs.starts import MOCAP, start_shapes
-from mjx_reinforce.envs.state import Before, Physics, observed, recollect_start, recollect_step
+from mjx_reinforce.envs.state import (
+    Before,
+    Physics,
+    first_state,
+    next_state,
+    physics_state,
+    recollect_start,
+    recollect_step,
+)
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco
@@ -76,17 +84,11 @@ class InBatch(Env):
 
     def _fields_read(self, data: Any) -> list[str]:
         """Returns the fields of mjData that the task reads, and those that an env step hands on."""
-        recorder: Any = FieldRecorder(data, self.env.mj_model)
-
-        def read(start_fields: dict[str, Any], episode: dict[str, Any], action: jax.Array) -> None:
-            recorder.episode = episode
-            read_all(self.env, Before(start_fields, self.env.mj_model, episode), recorder, action)
-
         names = (*models.CARRIED, *models.CONSTANT, *self._carried)
         specs = {name: spec_of(data, name) for name in names}
         start_fields = {name: jnp.zeros(spec.shape, spec.dtype) for name, spec in specs.items()}
-        jax.eval_shape(read, start_fields, self._episode, jnp.zeros(self.env.action_size))
-        return sorted({*recorder.names, *models.CARRIED, *self._carried})
+        names_read = fields_read(self.env, data, start_fields, self._episode)
+        return sorted({*names_read, *models.CARRIED, *self._carried})
 
     def _host_start(self, names: tuple[str, ...], settle_steps: int) -> HostCall:
         """Returns the operation that begins an episode, given fields of mjData by their names."""
@@ -147,58 +149,45 @@ class InBatch(Env):
         # As many simulations begin as there are keys, also where nothing is drawn: the batch that
         # steps them is the one that knows which of their bodies sleep.
         words = jax.random.key_data(rng)
-        return self.settled(start, episode, memory_rng, is_used & jnp.all(words == words))
+        is_used &= jnp.all(words == words)
+        return self.begin(start, episode, memory_rng, is_used, self.env.settle_steps)
 
     def set_state(
         self,
         qpos: jax.Array,
         qvel: jax.Array,
-        episode: dict[str, jax.Array] | None = None,
+        episode: Fields | None = None,
         rng: jax.Array | None = None,
         **fields: jax.Array,
     ) -> State:
         """Returns the state at positions [nq] and velocities [nv], as ``MujocoEnv.set_state``."""
         start = {"qpos": qpos, "qvel": qvel, **fields}
-        return self._start(start, episode or {}, rng, jnp.array(True), settle_steps=0)
+        return self.begin(start, episode or {}, rng, jnp.array(True), settle_steps=0)
 
-    def settled(
+    def begin(
         self,
-        start: dict[str, jax.Array],
-        episode: dict[str, jax.Array],
+        start: Fields,
+        episode: Fields,
         rng: jax.Array | None,
         is_used: jax.Array,
+        settle_steps: int,
     ) -> State:
-        """Returns the state after the task's ``settle_steps`` from fields of mjData.
+        """Returns the state of an episode that starts with fields of mjData.
 
         Args:
           start: the fields.
           episode: what ``randomize`` returned.
           rng: the key of the episode's memory; consumed.
           is_used: [] whether an episode begins; else what it returns means nothing.
+          settle_steps: physics steps before it begins.
         """
-        return self._start(start, episode, rng, is_used, self.env.settle_steps)
-
-    def _start(
-        self,
-        start: dict[str, jax.Array],
-        episode: dict[str, jax.Array],
-        rng: jax.Array | None,
-        is_used: jax.Array,
-        settle_steps: int,
-    ) -> State:
-        """Returns the state of an episode that starts with fields of mjData, where it is to []."""
-        real = jnp.result_type(float)
         begin = self._host_start(tuple(start), settle_steps)
-        start_fields = [jnp.asarray(x, real) for x in start.values()]
+        start_fields = [jnp.asarray(x, float) for x in start.values()]
         results = begin(is_used, *start_fields, *self._model_fields(episode))
-        physics, view, _ = self._simulated(results, episode)
+        view, carried, _ = self._simulated(results, episode)
         recollection = recollect_start(self.env, rng, view)
-        physics = dataclasses.replace(physics, **recollection._asdict())
-        zero = jnp.zeros((), real)
-        action = jnp.zeros(self.action_size, real)
-        terms = self._outcome(self._before(physics), view, action)[2]
-        metrics = dict.fromkeys(terms, zero)
-        return State(cast(Any, physics), observed(self.env, view), zero, zero, metrics)
+        physics = physics_state(self.env, view, {}, carried, recollection)
+        return first_state(self.env, physics, self._before(physics), view)
 
     def step(self, state: State, action: jax.Array) -> State:
         """Returns the state one env step later under ``action`` [A].
@@ -225,45 +214,30 @@ class InBatch(Env):
         if self.env.has_pushes:
             inputs.append(check_push(name, self.env.push(before_view), self.mj_model.nv))
         results = self._step_call(is_used, *inputs, *self._model_fields(before.episode))
-        physics, view, sound = self._simulated(results, before.episode)
+        view, carried, sound = self._simulated(results, before.episode)
         recollection = recollect_step(self.env, before, view, action)
-        physics = dataclasses.replace(physics, **recollection._asdict())
-        reward, terminated, terms = self._outcome(before_view, view, action)
-        dtype = state.reward.dtype
-        return dataclasses.replace(
-            state,
-            pipeline_state=physics,
-            obs=observed(self.env, view, cast(jax.Array, state.obs)),
-            reward=jnp.where(sound, jnp.asarray(reward, dtype), jnp.nan),
-            done=jnp.asarray(terminated, dtype),
-            metrics=state.metrics | jax.tree.map(lambda x: jnp.asarray(x, dtype), terms),
-        )
+        physics = physics_state(self.env, view, {}, carried, recollection)
+        outcome = check_outcome(name, self.env.outcome(before_view, view, action))
+        return next_state(self.env, state, physics, view, outcome, sound)
 
-    def _model_fields(self, episode: dict[str, jax.Array]) -> list[jax.Array]:
+    def _model_fields(self, episode: Fields) -> list[jax.Array]:
         """Returns the fields of the model that an episode has of its own."""
         return [episode[name] for name in self._simulations.randomized]
 
     def _simulated(
-        self, results: Sequence[jax.Array], episode: dict[str, jax.Array]
-    ) -> tuple[Physics, Any, jax.Array]:
-        """Returns what the next env step needs, what the task reads, and whether it is sound []."""
+        self, results: Sequence[jax.Array], episode: Fields
+    ) -> tuple[Before, Fields, jax.Array]:
+        """Returns what the task reads, what is carried besides, and whether it is sound []."""
         state, sound, *values = results
         fields = dict(zip(self._simulations.fields, values, strict=True))
         carried = {name: fields[name] for name in self._carried} | {STATE: state}
-        common: dict[str, Any] = {name: fields[name] for name in models.CARRIED}
-        physics = Physics(**common, carried=carried, episode=episode, constants={})
-        return physics, Before(fields, self.env.mj_model, episode), sound
+        return Before(fields, self.env.mj_model, episode), carried, sound
 
     def _before(self, state: Physics) -> Before:
         """Returns what a task knows of the start of an env step."""
         constant = {name: jnp.asarray(value) for name, value in self._constants.items()}
-        common = {name: getattr(state, name) for name in models.CARRIED}
-        fields = constant | state.carried | common
+        fields = constant | state.carried | models.fields_of(state, models.CARRIED)
         return Before(fields, self.env.mj_model, state.episode, state.memory)
-
-    def _outcome(self, before: Before, view: Any, action: jax.Array) -> Any:
-        """Returns what the task's ``outcome`` returns, checked."""
-        return check_outcome(type(self.env).__name__, self.env.outcome(before, view, action))
 
     @property
     def mj_model(self) -> MjModel:

@@ -4,14 +4,13 @@ import copy
 from typing import Any, cast
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from mjx_reinforce.engine.base import Environment
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import Before, MujocoEnv
-from mjx_reinforce.envs.c_mujoco.fields import FieldRecorder, read_all, spec_of
+from mjx_reinforce.envs.c_mujoco.fields import fields_read, spec_of
 from mjx_reinforce.envs.outcomes import check_control, check_push
 from mjx_reinforce.envs.state import (
     NOTHING,
@@ -58,15 +57,7 @@ class InMujoco:
         self.model = models.c_model(env.mj_model)
         self.data = _C.MjData(self.model)
         self._episode, _ = jax.eval_shape(env.draw, jax.random.key(0))
-        recorder: Any = FieldRecorder(self.data, env.mj_model)
-
-        # Which fields a task reads does not depend on their numbers: it is traced, as under jit.
-        def read(before, episode, action):
-            recorder.episode = episode
-            read_all(env, self._view(before, episode), recorder, action)
-
-        jax.eval_shape(read, self._start_fields(), self._episode, jnp.zeros(env.action_size))
-        self._names = sorted(recorder.names)
+        self._names = sorted(fields_read(env, self.data, self._start_fields(), self._episode))
         self._recollection = NOTHING
         self._observation: Any = None  # what the policy saw
         self.terms: dict[str, float] = {}

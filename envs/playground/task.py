@@ -198,7 +198,7 @@ class PlaygroundEnv(MujocoEnv):
 
         def forward(fields: dict[str, jax.Array]) -> Any:
             """Computes what the task reads of a simulation before it sets more of it."""
-            return self._forward(models.make_data(self.mj_model).replace(**fields))
+            return self._dynamics.forward(models.make_data(self.mj_model).replace(**fields))
 
         start = Start(self.task.mj_model, forward, data, self._outline.start_calls)
         with exchanged(start):

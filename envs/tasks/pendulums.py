@@ -4,7 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from mjx_reinforce.envs.base import NearPose
+from mjx_reinforce.envs.near_pose import NearPose
 
 _MAX_ANGLE = 0.2
 

@@ -11,7 +11,7 @@ import pytest
 
 from mjx_reinforce import envs, make_vec
 from mjx_reinforce.engine.base import shapes
-from mjx_reinforce.envs import base, derived, models
+from mjx_reinforce.envs import derived, dynamics, models
 from mjx_reinforce.envs.base import MujocoEnv
 
 #: MuJoCo's own names; it is a C extension without stubs.
@@ -177,7 +177,7 @@ def test_what_nothing_reads_is_not_derived():
 def test_asking_for_shapes_traces_no_physics(monkeypatch):
     """Although this model is no team's, and differs from episode to episode."""
     env = Mechanism()
-    monkeypatch.setattr(base, "_forward", lambda *_: pytest.fail("the physics is traced"))
+    monkeypatch.setattr(dynamics, "_forward", lambda *_: pytest.fail("the physics is traced"))
     start = shapes(env.reset, jax.random.key(0))
     after = shapes(env.step, start, np.zeros(env.action_size, np.float32))
     assert start.obs.shape == after.obs.shape == (env.observation_size,)

@@ -79,8 +79,8 @@ def rollout_of(
     """
     task: Any = make(env_id)
     if name == "plain MJX":
-        task._forward = partial(mjx.forward, task.model)
-        task._physics_step = partial(mjx.step, task.model)
+        task._dynamics.forward = partial(mjx.forward, task.model)
+        task._dynamics.physics_step = partial(mjx.step, task.model)
     env = Loop(task, steps)
     if run is None:
         network, actor = untrained(env)

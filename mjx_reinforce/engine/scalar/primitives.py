@@ -44,7 +44,7 @@ Who asks, and why (kept by hand: a new caller adds its row):
 ====================================  =============================================================
 ``base.is_kept_whole``
 ====================================  =============================================================
-``envs/base.py``                      whether ``whole`` stands for the steps of the physics; for
+``envs/dynamics.py``                  whether ``whole`` stands for the steps of the physics; for
                                       shapes alone (``base.is_for_shapes``) it always does
 ``play/units.py``                     whether ``whole`` stands for a layer of the network
 ====================================  =============================================================
