@@ -30,6 +30,11 @@ _MAX_RATIO = 32
 Arrays = dict[str, np.ndarray]
 
 
+def expanded(path: str | Path) -> Path:
+    """Returns a path with the folder that ``~`` stands for, as a shell reads it."""
+    return Path(os.path.expanduser(path))
+
+
 def write_bytes(path: Path, content: bytes) -> None:
     """Replaces a file at once: a reader, a crash or a power cut sees the old one or the new one."""
     # In the same folder: a file system replaces at once only what is its own.

@@ -20,12 +20,14 @@ from mjx_reinforce.export.run_files import (
     PolicyChoice,
     Run,
     SeedChoice,
+    check_policies,
     choose_seed,
     policy_folder,
     read_run,
 )
 from mjx_reinforce.files import (
     Arrays,
+    expanded,
     finite,
     naming_damage,
     read_arrays,
@@ -99,7 +101,8 @@ def load_policy(directory: str | Path, seed: int | None = None) -> tuple[Policy,
     """Reads what ``save_policy`` wrote.
 
     Args:
-      directory: the ``policy`` folder of a run.
+      directory: the folder of policies: ``policy`` in that of a run, or ``policy/best``. ``load``
+        takes the run itself.
       seed: which seed's actor; all of them, stacked [S, ...], if not given.
 
     Returns:
@@ -107,7 +110,8 @@ def load_policy(directory: str | Path, seed: int | None = None) -> tuple[Policy,
       outputs.
 
     Raises:
-      ValueError: the files cannot be read or are damaged, or there is no such seed.
+      ValueError: it is another folder, such as that of the run, the files cannot be read or are
+        damaged, or there is no such seed.
 
     Examples:
       >>> import pathlib, tempfile
@@ -142,8 +146,10 @@ def read_policy(
       trusted_code: "module:name" of a distribution that may be imported; what only a file names is
         not.
     """
-    settings_path = Path(directory) / "policy.json"
-    actor_path = Path(directory) / "actor.npz"
+    folder = expanded(directory)
+    check_policies(folder)
+    settings_path = folder / "policy.json"
+    actor_path = folder / "actor.npz"
     settings = read_json(settings_path)
     arrays = read_arrays(actor_path, stored=True)
     # The checksum finds damage, not ill will: who changes the files can compute it again.

@@ -4,14 +4,13 @@ The package has a folder of NumPy files and JSON for each task with a trained po
 ``python -m experiments.studies.results pretrained DIR`` writes.
 """
 
-import os
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from mjx_reinforce.engine.checks import check_type, nearest
-from mjx_reinforce.files import naming_damage, read_json
+from mjx_reinforce.files import expanded, naming_damage, read_json
 from mjx_reinforce.settings.config import read_seeds
 
 #: A seed by its rank in the run's final evaluation, or by its number.
@@ -70,7 +69,7 @@ def read_run(directory: str | Path) -> Run:
     Raises:
       ValueError: it is not a run directory, or it has no policy yet.
     """
-    directory = Path(os.path.expanduser(directory))
+    directory = expanded(directory)
     if str(directory) in pretrained() and not directory.exists():
         name = str(directory)
         facts = provenance_of(name)
@@ -79,12 +78,12 @@ def read_run(directory: str | Path) -> Run:
     if not path.is_file():
         if (directory / "sweep.json").is_file():
             raise ValueError(
-                f"{directory} is a sweep: name the policies of one of its configurations, such as "
+                f"{directory} is a sweep: name the run of one of its configurations, such as "
                 f"{directory / 'policies' / '000'}"
             )
+        hint = run_hint(directory)
         # Who names a directory that does not exist may have meant a task.
-        hint = ""
-        if not directory.is_dir():
+        if not (hint or directory.is_dir()):
             hint = _packaged(directory.name)
         raise ValueError(f"{directory} is not a run directory: there is no {path}{hint}")
     config: dict[str, Any] = {"seeds": None, "env_set": []} | read_json(path)
@@ -104,6 +103,28 @@ def read_run(directory: str | Path) -> Run:
     if seeds is not None:
         seeds = tuple(seeds)
     return Run(directory, config["env"], config["horizon"], seeds, tuple(config["env_set"]))
+
+
+def run_hint(path: Path) -> str:
+    """Returns what a message adds about a path in a run, such as RUN/policy/best; else nothing."""
+    for run in path.parents[:2]:
+        if (run / "config.json").is_file() and (run / "policy").is_dir():
+            return f"; it is in the run {run}, so name that"
+    return ""
+
+
+def check_policies(folder: Path) -> None:
+    """Raises ValueError for a run, a sweep, or a task where a folder of policies was to be named.
+
+    Other folders pass, also those that hold no policies.
+    """
+    is_run = any((folder / name).is_file() for name in ("config.json", "sweep.json"))
+    if not (folder / "policy.json").exists() and (is_run or str(folder) in pretrained()):
+        policies = policy_folder(read_run(folder), "last")
+        raise ValueError(
+            f"{folder} stands for a run, and the folder of its policies is {policies}: name that, "
+            f"or give {folder} to mjx_reinforce.load"
+        )
 
 
 def _packaged(name: str) -> str:

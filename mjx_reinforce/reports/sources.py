@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.engine.checks import check_type
+from mjx_reinforce.export.run_files import run_hint
 from mjx_reinforce.files import naming_damage, read_arrays, read_json
 from mjx_reinforce.reports.experiment import (
     Configuration,
@@ -290,9 +291,8 @@ def read_directory(directory: Path) -> Source:
             return read(directory, content)
     if not directory.is_dir():
         raise ValueError(f"there is no directory {directory}; name that of a run or a sweep")
-    raise ValueError(
-        f"{directory} is neither a run nor a sweep: it has no config.json and no sweep.json"
-    )
+    reason = run_hint(directory) or ": it has no config.json and no sweep.json"
+    raise ValueError(f"{directory} is neither a run nor a sweep{reason}")
 
 
 def _read_run(directory: Path, config: dict[str, Any]) -> Source:

@@ -2,20 +2,19 @@
 
 import dataclasses
 import gc
-import os
 import shlex
 import sys
 import traceback
 from collections.abc import Sequence
 from dataclasses import fields
-from pathlib import Path
 from typing import NoReturn
 
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.streams import accept_everything, say_error, silence_alarms
-from mjx_reinforce.files import FULL_ERRORS, MovedError
+from mjx_reinforce.export.run_files import run_hint
+from mjx_reinforce.files import FULL_ERRORS, MovedError, expanded
 from mjx_reinforce.runs.design import Design, SweepSettings, check_swept, read_design, read_over
 from mjx_reinforce.runs.perform import perform, report_on
 from mjx_reinforce.settings.config import (
@@ -142,9 +141,9 @@ def _default(arguments: Sequence[str], *, timed: bool) -> Config:
     """Returns the settings that hold where the user gives none: a task's, or those of a run."""
     if not (like := flag_value(arguments, "--like")):
         return for_arguments(arguments, timed=timed)
-    directory = Path(os.path.expanduser(like))
+    directory = expanded(like)
     if not (directory / "config.json").is_file():
-        raise ValueError(f"--like {like}: there is no run, for it has no config.json")
+        raise ValueError(f"--like {like}: there is no run (no config.json){run_hint(directory)}")
     config = read_design(directory).base
     check_named(vars(config), named_code(arguments), directory)
     # ``read_design`` prepares for going on in that directory; this run only takes its settings.

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.engine.checks import check_kind
 from mjx_reinforce.export.policy_files import Player, played_policy
 from mjx_reinforce.export.run_files import PolicyChoice
-from mjx_reinforce.files import Arrays, naming_damage, read_arrays, read_json
+from mjx_reinforce.files import Arrays, expanded, naming_damage, read_arrays, read_json
 from mjx_reinforce.learning.policy import Actor, Policy
 from mjx_reinforce.runs.design import Design, check_swept
 from mjx_reinforce.runs.perform import perform, report_on
@@ -285,7 +284,7 @@ def _beginning(name: str, config: Config, output: Path | str | None) -> Config:
     output_directory = config.output if output is None else output
     # ``~`` is read as on the command line.
     if output_directory is not None:
-        output_directory = Path(os.path.expanduser(output_directory))
+        output_directory = expanded(output_directory)
     return dataclasses.replace(config, output=output_directory)
 
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +17,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.commands import COMMANDS, command
 from mjx_reinforce.console.streams import accept_everything, say_error
 from mjx_reinforce.engine.checks import fits, nearest, read_as, whole_number
-from mjx_reinforce.files import FULL_ERRORS
+from mjx_reinforce.files import FULL_ERRORS, expanded
 from mjx_reinforce.registry import is_own
 from mjx_reinforce.settings.config import flag, marked
 from mjx_reinforce.settings.declare import Range
@@ -32,7 +31,7 @@ _READERS = ConstructorRegistry()
 _CONVERTERS: dict[Any, tuple[str, Callable[[str], Any]]] = {
     int: ("INT", whole_number),
     type(None): ("{None}", functools.partial(read_as, type(None))),
-    Path: ("PATH", lambda word: Path(os.path.expanduser(word))),
+    Path: ("PATH", expanded),
 }
 #: Flags of layers.
 _LAYERS = [flag(name) for name in marked(Range.LAYERS)]

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_reinforce.engine.checks import fits
+from mjx_reinforce.export.run_files import run_hint
 from mjx_reinforce.files import Arrays, check_archive, read_json, write_bytes
 from mjx_reinforce.settings.config import Config, check_each, flag, marked
 from mjx_reinforce.settings.declare import MAX_COUNT, Mark
@@ -57,16 +58,10 @@ def read_record(directory: Path) -> dict[str, Any]:
       ValueError: it is not there, or it is damaged.
     """
     for name in FIRST_FILES:
-        try:
+        if (directory / name).exists():
             return read_json(directory / name)
-        except ValueError as error:
-            # A file that is there and damaged is no reason to look for the other one.
-            if not isinstance(error.__cause__, FileNotFoundError):
-                raise
-    raise ValueError(
-        f"cannot resume {directory}: there is no {' or '.join(FIRST_FILES)}; put back a copy, or, "
-        "if nothing was begun there, start it anew with --output"
-    )
+    remedy = run_hint(directory) or "; put back a copy, or begin anew with --output"
+    raise ValueError(f"cannot resume {directory}: there is no {' or '.join(FIRST_FILES)}{remedy}")
 
 
 def as_config(record: Mapping[str, Any], path: Path) -> Config:

@@ -12,6 +12,8 @@ from saved_runs import change, change_arrays, make_run, write
 
 from mjx_reinforce import act, load, load_policy, watch
 from mjx_reinforce.export import __main__ as export
+from mjx_reinforce.reports.sources import read_directory
+from mjx_reinforce.runs.command_line import parse
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(5, 4))
 KERNEL = "params__network__params__Dense_0__kernel"
@@ -290,5 +292,47 @@ def test_what_somebody_meant_is_named(tmp_path):
     ):
         load("Hoper-v5")
     (tmp_path / "sweep.json").write_text("{}")
-    with pytest.raises(ValueError, match="is a sweep: name the policies of one of its config"):
+    with pytest.raises(ValueError, match="is a sweep: name the run of one of its configurations"):
         load(tmp_path)
+
+
+def test_a_run_is_not_the_folder_of_its_policies(tmp_path, monkeypatch):
+    """Whoever names the run, a sweep or a task hears of the folder; whoever has that, of no run."""
+    run = make_run(tmp_path / "run")
+    folder = re.escape(f"the folder of its policies is {run / 'policy'}: name that, or give {run} ")
+    with pytest.raises(ValueError, match=f"{re.escape(str(run))} stands for a run, and {folder}"):
+        load_policy(run)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    with pytest.raises(ValueError, match=folder):
+        load_policy("~/run")
+    assert load_policy("~/run/policy", 0)
+    with pytest.raises(ValueError, match="trained/CartPole-v1: name that, or give CartPole-v1 to"):
+        load_policy("CartPole-v1")
+    (tmp_path / "sweep.json").write_text("{}")
+    with pytest.raises(ValueError, match="is a sweep: name the run of one of its configurations"):
+        load_policy(tmp_path)
+    # One's own policies, beside another program's config.json.
+    write(run / "policy" / "config.json", {})
+    assert load_policy(run / "policy", 0)
+    (run / "policy.json").write_text("{}")
+    with pytest.raises(ValueError, match=r"cannot read .*actor\.npz"):
+        load_policy(run)
+    with pytest.raises(ValueError, match=r"cannot read nowhere/policy\.json"):
+        load_policy("nowhere")
+
+
+@pytest.mark.parametrize("place", ["policy", "policy/best"])
+def test_the_run_around_a_folder_is_named(tmp_path, place):
+    run = make_run(tmp_path, folder="policy/best")
+    hint = f"; it is in the run {run}, so name that"
+    for call in (
+        lambda: load(run / place),
+        lambda: read_directory(run / place),
+        lambda: parse(["--resume", str(run / place)]),
+        lambda: parse(["--like", str(run / place)]),
+    ):
+        with pytest.raises(ValueError, match=r"run|sweep") as caught:
+            call()
+        assert str(caught.value).endswith(hint)
+    with pytest.raises(ValueError, match=r"there is no .*config.json$"):
+        load(tmp_path.parent)
