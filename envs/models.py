@@ -227,12 +227,14 @@ def make_data(model: MjModel) -> mjx.Data:
         return contacts.make_data(_without_contacts(model), device)
 
 
+@jax.ensure_compile_time_eval()
 def without_contacts(model: MjModel) -> mjx.Model:
-    """Returns MJX's version of a model in which nothing touches: all but contacts is the same."""
+    """Returns MJX's version of a model in which nothing touches: all but contacts is the same.
+
+    As of ``to_mjx``, its arrays are constants where it is asked for while something is traced.
+    """
     device = jax.local_devices()[0]
-    # It may be asked for while something is traced; its arrays are constants there.
-    with jax.ensure_compile_time_eval():
-        return mjx.put_model(_without_contacts(model), impl="jax", device=device)
+    return mjx.put_model(_without_contacts(model), impl="jax", device=device)
 
 
 def has_data(model: MjModel) -> bool:
@@ -245,8 +247,9 @@ def has_data(model: MjModel) -> bool:
     return True
 
 
+@jax.ensure_compile_time_eval()
 def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
-    """Returns MJX's version of a model.
+    """Returns MJX's version of a model, of constants also where an environment is made under jit.
 
     Args:
       model: of ``load_model``.

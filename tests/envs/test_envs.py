@@ -13,6 +13,7 @@ import pytest
 from brax.envs import wrappers
 from command_lines import run_command
 from gymnasium.envs.registration import load_env_creator
+from places import ROOT
 
 from mjx_reinforce import Environment, envs, watch
 from mjx_reinforce.engine import objects
@@ -78,6 +79,50 @@ def test_a_step_keeps_shapes_and_dtypes_and_its_argument(id):
             assert start.obs.shape == (env.observation_size,) == (observation_size(env),)
             assert start.reward.shape == start.done.shape == ()
             assert start.obs.dtype == start.reward.dtype == start.done.dtype == dtype
+
+
+@all_in_turn
+def test_environments_are_made_where_a_program_is_traced(ids):
+    """Their models are constants there, and an environment that left the trace still plays."""
+    made_inside = {}
+
+    def make(key):
+        made_inside.update({id: envs.make(id) for id in ids})
+        return made_inside[ids[-1]].reset(key).obs
+
+    jax.eval_shape(make, jax.random.key(0))
+    for id, env in made_inside.items():
+        leaves = jax.tree.leaves(getattr(env, "model", None))
+        assert not any(isinstance(leaf, jax.core.Tracer) for leaf in leaves), id
+
+
+def test_an_environment_made_under_jit_plays_as_one_made_before(tmp_path):
+    """Also of one's own MJCF and constants, under vmap, and after the trace."""
+    path = tmp_path / "own.xml"
+    path.write_text((ROOT / "envs" / "assets" / "inverted_pendulum.xml").read_text())
+    kept = []
+
+    class Own(type(made("InvertedPendulum-v5"))):
+        def __init__(self):
+            super().__init__(xml_file=str(path))
+            self.force = jnp.ones(1)
+
+        def control(self, action):
+            return action + self.force
+
+    def play(env, key):
+        return env.step(env.reset(key), jnp.zeros(1)).obs
+
+    def make(key):
+        kept.append(envs.make("InvertedPendulum-v5"))
+        return play(Own(), key), play(kept[0], key)
+
+    keys = jax.random.split(jax.random.key(0), 2)
+    pushed, alone = jax.jit(jax.vmap(make))(keys)
+    expected = jax.vmap(functools.partial(play, made("InvertedPendulum-v5")))(keys)
+    np.testing.assert_allclose(alone, expected, rtol=1e-6)
+    np.testing.assert_allclose(play(kept[0], keys[0]), expected[0], rtol=1e-6)
+    np.testing.assert_allclose(pushed, jax.vmap(functools.partial(play, Own()))(keys), rtol=1e-6)
 
 
 @all_in_turn

@@ -1,5 +1,6 @@
 """Tasks of MuJoCo Playground: their own code, on the physics of the engines here."""
 
+import functools
 import os
 import subprocess
 import sys
@@ -164,6 +165,22 @@ def test_a_task_plays_as_by_itself():
 
 
 @pytest.mark.slow
+def test_a_task_is_made_where_a_program_is_traced():
+    def play(make, key):
+        env = make()
+        return env.step(env.reset(key), jnp.zeros(env.action_size)).obs
+
+    makers = (
+        lambda: envs.from_playground(Cart()),
+        lambda: envs.make("playground:PendulumSwingup"),
+    )
+    for make in makers:
+        env = make()
+        inside = jax.jit(functools.partial(play, make))(jax.random.key(0))
+        outside = jax.jit(functools.partial(play, lambda env=env: env))(jax.random.key(0))
+        np.testing.assert_allclose(inside, outside, rtol=1e-5)
+
+
 def test_engines_play_the_same():
     """With a reward of the user's own class."""
     env = envs.from_playground(Near())
