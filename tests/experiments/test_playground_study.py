@@ -1,5 +1,7 @@
 """The study of Playground's suite: what its tables say of made-up runs, and how a run goes on."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -147,6 +149,13 @@ def test_a_run_goes_on_for_more_minutes_and_is_not_repeated(tmp_path, monkeypatc
     assert all(0 <= float(row["return"]) <= 1000 for row in first)
     assert runs.train(tasks[1:], tmp_path, num_seeds=2, minutes=0.02)
     assert "is there" in capsys.readouterr().out
+    summary_path = tmp_path / "PendulumSwingup" / "summary.json"
+    summary = summary_path.read_text()
+    for status, is_new_budget in {"finished": True, "interrupted": False, "running": False}.items():
+        summary_path.write_text(json.dumps(json.loads(summary) | {"status": status}))
+        design = runs._design(summary_path.parent, runs.settings_of(tasks[1], 2, 0.1))
+        assert (design.base.minutes is not None) == is_new_budget, status
+    summary_path.write_text(summary)
     assert runs.train(tasks[1:], tmp_path, num_seeds=2, minutes=0.1)
     second = rows.read(runs.returns_path(tmp_path, "PendulumSwingup", 0.1))
     steps = [np.array([float(row["env_steps"]) for row in x]) for x in (first, second)]

@@ -96,7 +96,8 @@ def _design(run: Path, config: Config) -> Design:
         return Design(base=dataclasses.replace(config, output=run))
     design = read_design(run)
     summary_path = run / "summary.json"
-    if not summary_path.exists() or read_json(summary_path)["status"] == "interrupted":
+    # A run that was killed says that it is running.
+    if not summary_path.exists() or read_json(summary_path)["status"] in {"interrupted", "running"}:
         # Its budget is that of its minutes, in env steps.
         return design
     assert config.minutes is not None
