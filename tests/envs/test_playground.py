@@ -181,6 +181,7 @@ def test_a_task_is_made_where_a_program_is_traced():
         np.testing.assert_allclose(inside, outside, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_engines_play_the_same():
     """With a reward of the user's own class."""
     env = envs.from_playground(Near())
