@@ -66,8 +66,9 @@ class Dynamics:
             self._model = models.to_mjx(mj_model, source)
         except UnsupportedError as error:  # C MuJoCo may play it
             self.refusal = str(error)
-        # By the names of the fields that are random, which are the same for a task.
-        self._why_no_code = functools.cache(functools.partial(supported.why, mj_model))
+        # Why the device code cannot, by the names of the fields that are random. No
+        # ``functools.cache``, which cloudpickle, and so Ray, could not send to another process.
+        self._code_refusals: dict[tuple[str, ...], str | None] = {}
 
     @property
     def model(self) -> mjx.Model:
@@ -103,7 +104,9 @@ class Dynamics:
 
     def is_in_device_code(self, random: tuple[str, ...]) -> bool:
         """Returns whether the device code has the model and the fields of it that are random."""
-        return self._why_no_code(random) is None
+        if random not in self._code_refusals:
+            self._code_refusals[random] = supported.why(self._mj_model, random)
+        return self._code_refusals[random] is None
 
     def start(self, data: mjx.Data, drawn: Fields, simulated: PhysicsModel) -> Any:
         """Returns the simulation at the start of an episode, by one forward pass.

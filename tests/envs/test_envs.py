@@ -5,6 +5,7 @@ import functools
 import inspect
 import json
 
+import cloudpickle
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -84,14 +85,14 @@ def test_a_step_keeps_shapes_and_dtypes_and_its_argument(id):
 @all_in_turn
 def test_environments_are_made_where_a_program_is_traced(ids):
     """Their models are constants there, and an environment that left the trace still plays."""
-    made_inside = {}
+    environments = {}
 
     def make(key):
-        made_inside.update({id: envs.make(id) for id in ids})
-        return made_inside[ids[-1]].reset(key).obs
+        environments.update({id: envs.make(id) for id in ids})
+        return environments[ids[-1]].reset(key).obs
 
     jax.eval_shape(make, jax.random.key(0))
-    for id, env in made_inside.items():
+    for id, env in environments.items():
         leaves = jax.tree.leaves(getattr(env, "model", None))
         assert not any(isinstance(leaf, jax.core.Tracer) for leaf in leaves), id
 
@@ -123,6 +124,17 @@ def test_an_environment_made_under_jit_plays_as_one_made_before(tmp_path):
     np.testing.assert_allclose(alone, expected, rtol=1e-6)
     np.testing.assert_allclose(play(kept[0], keys[0]), expected[0], rtol=1e-6)
     np.testing.assert_allclose(pushed, jax.vmap(functools.partial(play, Own()))(keys), rtol=1e-6)
+
+
+def test_cloudpickle_copies_a_new_environment():
+    """It is how Ray and others send one to their processes."""
+
+    def play(env):
+        return env.step(env.reset(jax.random.key(0)), jnp.zeros(3)).obs
+
+    env = envs.make("Hopper-v5")
+    copy = cloudpickle.loads(cloudpickle.dumps(env))
+    np.testing.assert_array_equal(play(copy), play(env))
 
 
 @all_in_turn
