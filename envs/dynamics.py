@@ -187,8 +187,7 @@ class Dynamics:
         known = self._model or models.without_contacts(self._mj_model)
 
         def completed_data(drawn: Fields, data: mjx.Data, touch: jax.Array) -> Any:
-            model = known.replace(**drawn)
-            return last_pass.completed_data(self._mj_model, model, data, touch)
+            return last_pass.completed_data(self._mj_model, known.replace(**drawn), data, touch)
 
         return jax.jit(completed_data)
 
@@ -207,10 +206,9 @@ class Dynamics:
         results = {jax.tree_util.keystr(path): leaf for path, leaf in paths}
         sound = jax.ShapeDtypeStruct((), bool)
         operands = [getattr(start, field) for field in ("ctrl", *models.CARRIED)]
-        random = simulated.random
-        if (random or self._mj_model.nmocap) and self.is_in_device_code(random):
+        if (simulated.random or self._mj_model.nmocap) and self.is_in_device_code(simulated.random):
             numbers = drawn | models.fields_of(start, MOCAP)
-            operands.append(tables.drawn_numbers(self._mj_model, random, numbers))
+            operands.append(tables.drawn_numbers(self._mj_model, simulated.random, numbers))
         touch = jnp.zeros(len(last_pass.touch_sensors(self._mj_model)), start.qpos.dtype)
         last = {"pass_qpos": start.qpos, "pass_qvel": start.qvel, "pass_qacc": start.qacc}
         last |= {"touch": touch, "sound": sound}

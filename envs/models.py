@@ -233,8 +233,7 @@ def without_contacts(model: MjModel) -> mjx.Model:
 
     As of ``to_mjx``, its arrays are constants where it is asked for while something is traced.
     """
-    device = jax.local_devices()[0]
-    return mjx.put_model(_without_contacts(model), impl="jax", device=device)
+    return mjx.put_model(_without_contacts(model), impl="jax", device=jax.local_devices()[0])
 
 
 def has_data(model: MjModel) -> bool:

@@ -4,6 +4,7 @@ The package has a folder of NumPy files and JSON for each task with a trained po
 ``python -m experiments.studies.results pretrained DIR`` writes.
 """
 
+import os
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -108,7 +109,7 @@ def read_run(directory: str | Path) -> Run:
 def run_hint(path: Path) -> str:
     """Returns what a message adds about a path in a run, such as RUN/policy/best; else nothing."""
     for run in path.parents[:2]:
-        if (run / "config.json").is_file() and (run / "policy").is_dir():
+        if os.path.isfile(run / "config.json") and os.path.isdir(run / "policy"):
             return f"; it is in the run {run}, so name that"
     return ""
 
@@ -118,8 +119,10 @@ def check_policies(folder: Path) -> None:
 
     Other folders pass, also those that hold no policies.
     """
-    is_run = any((folder / name).is_file() for name in ("config.json", "sweep.json"))
-    if not (folder / "policy.json").exists() and (is_run or str(folder) in pretrained()):
+    # Not by pathlib, which raises OSError for a folder that may not be entered: what reads
+    # policy.json names that.
+    is_run = any(os.path.isfile(folder / name) for name in ("config.json", "sweep.json"))
+    if not os.path.exists(folder / "policy.json") and (is_run or str(folder) in pretrained()):
         policies = policy_folder(read_run(folder), "last")
         raise ValueError(
             f"{folder} stands for a run, and the folder of its policies is {policies}: name that, "

@@ -58,8 +58,13 @@ def read_record(directory: Path) -> dict[str, Any]:
       ValueError: it is not there, or it is damaged.
     """
     for name in FIRST_FILES:
-        if (directory / name).exists():
+        try:
             return read_json(directory / name)
+        except ValueError as error:
+            # A file that is damaged, or in a folder that may not be entered, is no reason to look
+            # for the other one.
+            if not isinstance(error.__cause__, FileNotFoundError):
+                raise
     remedy = run_hint(directory) or "; put back a copy, or begin anew with --output"
     raise ValueError(f"cannot resume {directory}: there is no {' or '.join(FIRST_FILES)}{remedy}")
 

@@ -300,6 +300,7 @@ UNREACHABLE = {
     "sweep --over discount 1 0.9 --output closed/run": "closed/run (Permission",
     "train --resume closed/run": "closed/run/config.json (Permission denied)",
     "sweep --resume closed/run": "closed/run/config.json (Permission denied)",
+    "train --resume closed/run/policy": "closed/run/policy/config.json (Permission denied)",
     "watch closed/run": "Permission denied",
     "report closed/run": "Permission denied",
     "export closed/run": "Permission denied",

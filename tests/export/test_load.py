@@ -319,6 +319,8 @@ def test_a_run_is_not_the_folder_of_its_policies(tmp_path, monkeypatch):
         load_policy(run)
     with pytest.raises(ValueError, match=r"cannot read nowhere/policy\.json"):
         load_policy("nowhere")
+    with pytest.raises(ValueError, match=r"cannot read .*policy\.json \(File name too long\)"):
+        load_policy("x" * 300)
 
 
 @pytest.mark.parametrize("place", ["policy", "policy/best"])
