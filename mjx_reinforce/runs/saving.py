@@ -219,6 +219,11 @@ class RunFiles(Files[RunDriver]):
         self.contents |= {name: getattr(config, name) for name in resume.BUDGETS}
         self._write_json("config.json", self.contents)
 
+    def _write_budgets(self, config: Config) -> None:
+        """Writes config.json again if it has other budgets."""
+        if tuple(self.contents["budgets"]) != config.budgets:
+            self._write_config(config)
+
     def _take_back(self, driver: RunDriver, checkpoint: Checkpoint | None) -> None:
         """Takes the files back to a checkpoint, and says in config.json that the run goes on.
 
@@ -251,6 +256,8 @@ class RunFiles(Files[RunDriver]):
     def finished(self, driver: RunDriver, summary: dict[str, Any]) -> None:
         """Writes the last files, summary.json last of all, or raises OSError."""
         self._check_place()
+        # A late run is ended by a budget that is found after its last checkpoint.
+        self._write_budgets(driver.config)
         self._save_policies(driver)
         self._write_rows()
         write_arrays(self._directory / "returns.npz", driver.record.training(), compressed=True)
@@ -278,8 +285,7 @@ class RunFiles(Files[RunDriver]):
         """Writes a checkpoint, which says how long metrics.csv is with all rows in it."""
         self._write_rows()
         # First, as it chooses the checkpoint.
-        if tuple(self.contents["budgets"]) != driver.config.budgets:
-            self._write_config(driver.config)
+        self._write_budgets(driver.config)
         checkpoint = driver.checkpoint()._replace(metrics_bytes=self._metrics.stat().st_size)
         resume.save(
             self._checkpoints, checkpoint, is_even=checkpoint.is_even(driver.config.eval_every)

@@ -79,6 +79,25 @@ def test_a_run_in_time_goes_on_from_any_of_its_budgets(run, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_late_run_records_the_budget_that_ends_it(run, tmp_path, monkeypatch):
+    """It is found after the last checkpoint, where a machine became slower at the end."""
+    calls = itertools.count()
+
+    def budget(self, seconds, env_steps, present_budget):
+        return int(env_steps.min()) if next(calls) == 10 else None
+
+    monkeypatch.setattr(minutes.Deadline, "budget", budget)
+    timed = ["--minutes", 0.05, "--checkpoint-every", 5, "--eval-every", 5, "--output", "late"]
+    assert run(*SMALL, *timed) == 0
+    late = tmp_path / "late"
+    assert next(calls) == 11
+    summary = json.loads((late / "summary.json").read_text())
+    assert settings(late)["env_steps"] == min(summary["env_steps"])
+    assert run("--like", "late", "--output", "again") == 0
+    assert_same(late, tmp_path / "again")
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("gpu", [False, True])
 def test_a_default_run_has_the_budget_of_its_machine(monkeypatch, gpu):
     monkeypatch.setattr(defaults, "has_gpu", lambda: gpu)
